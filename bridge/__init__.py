@@ -1,0 +1,1 @@
+"""The wire: links, MAVLink framing and services, both faces."""

@@ -1,0 +1,172 @@
+"""TCP: a stream of bytes to one peer, and word when it goes."""
+
+from __future__ import annotations
+
+import select
+import socket
+
+from bridge.clock import WallClock
+from bridge.errors import LinkClosed, PeerLost, PeerSilent
+from bridge.link import Link
+from bridge.udp_link import bind, resolve
+
+_CHUNK = 65_536
+_STUCK_S = 1.0
+_RETRY_US = 50_000
+
+
+class TcpLink(Link):
+    """A TCP connection, made by us or by the peer.
+
+    - `listen`: takes one peer at a time, the next one when that one has gone. PeerLost is raised once for
+      each; the link itself lives on and a further `recv` waits for the next peer. Without a peer, sends are
+      dropped.
+    - `connect`: PeerLost is final; every further use repeats it.
+    """
+
+    datagram = False
+
+    def __init__(self, name: str, *, listener: socket.socket | None, peer: socket.socket | None) -> None:
+        super().__init__(name)
+        self._listener = listener
+        self._peer = peer
+        self._closed = False
+        self._lost: str | None = None
+        self._clock = WallClock()
+        for sock in (listener, peer):
+            if sock is not None:
+                sock.setblocking(False)
+        if peer is not None:
+            _at_once(peer)
+
+    @classmethod
+    def listen(cls, host: str, port: int) -> TcpLink:
+        """Wait for peers on `host:port`; port 0 takes a free one (see `port`).
+
+        Raises:
+            PortBusy: another program holds the port.
+            LinkUrlError: the host is not one of this computer's.
+        """
+        url = f"tcpin://{host}:{port}"
+        family, address = resolve(url, host, port, socket.SOCK_STREAM)
+        sock = socket.socket(family, socket.SOCK_STREAM)
+        # Else the port stays busy for a minute after each run.
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bind(url, sock, address)
+        sock.listen(1)
+        return cls(f"tcpin://{host}:{sock.getsockname()[1]}", listener=sock, peer=None)
+
+    @classmethod
+    def connect(cls, host: str, port: int, *, limit_s: float = 3.0) -> TcpLink:
+        """Connect to `host:port`, trying again until `limit_s` has passed: the peer may still be starting.
+
+        Raises:
+            PeerSilent: nobody accepted in time.
+            LinkUrlError: the host cannot be found.
+        """
+        url = f"tcpout://{host}:{port}"
+        family, address = resolve(url, host, port, socket.SOCK_STREAM)
+        clock = WallClock()
+        deadline_us = clock.now_us() + int(limit_s * 1e6)
+        while True:
+            sock = socket.socket(family, socket.SOCK_STREAM)
+            sock.settimeout(max(0.001, (deadline_us - clock.now_us()) * 1e-6))
+            try:
+                sock.connect(address)
+            except OSError as error:
+                sock.close()
+                if clock.now_us() + _RETRY_US >= deadline_us:
+                    raise PeerSilent(
+                        url, limit_s, "a listening program", f"Is it running, on that port? ({error})"
+                    ) from None
+                clock.sleep_until_us(clock.now_us() + _RETRY_US)
+            else:
+                return cls(url, listener=None, peer=sock)
+
+    @property
+    def port(self) -> int:
+        """The local port."""
+        sock = self._listener or self._peer
+        if self._closed or sock is None:
+            raise LinkClosed(self.name)
+        return int(sock.getsockname()[1])
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a peer right now, as far as is known."""
+        return self._peer is not None
+
+    def send(self, data: bytes) -> None:
+        """Send all the bytes; a peer that takes none of them for a second is taken for lost."""
+        peer = self._present(0.0)
+        if peer is None:
+            self.dropped += 1
+            return
+        view = memoryview(data)
+        while view:
+            try:
+                view = view[peer.send(view) :]
+            except BlockingIOError:
+                if not select.select([], [peer], [], _STUCK_S)[1]:
+                    raise self._parted(f"it read nothing for {_STUCK_S:g} s") from None
+            except OSError as error:
+                raise self._parted(error.strerror or str(error)) from None
+
+    def recv(self, timeout_s: float = 0.0) -> bytes | None:
+        """Return what has arrived, taking the next peer if there is none."""
+        deadline_us = self._clock.now_us() + int(timeout_s * 1e6) if timeout_s > 0.0 else 0
+        peer = self._present(timeout_s)
+        if peer is None:
+            return None
+        while True:
+            try:
+                data = peer.recv(_CHUNK)
+            except BlockingIOError:
+                remaining_s = (deadline_us - self._clock.now_us()) * 1e-6 if deadline_us else 0.0
+                if remaining_s <= 0.0 or not select.select([peer], [], [], remaining_s)[0]:
+                    return None
+                continue
+            except OSError as error:
+                raise self._parted(error.strerror or str(error)) from None
+            if not data:
+                raise self._parted("it closed the connection")
+            return data
+
+    def close(self) -> None:
+        """Release the port and the peer."""
+        for sock in (self._peer, self._listener):
+            if sock is not None:
+                sock.close()
+        self._peer = self._listener = None
+        self._closed = True
+
+    def _present(self, timeout_s: float) -> socket.socket | None:
+        """Return the peer, waiting for one to connect; None if there is none yet."""
+        if self._peer is not None:
+            return self._peer
+        if self._closed:
+            raise LinkClosed(self.name)
+        if self._listener is None:
+            raise PeerLost(self.name, self._lost or "it closed the connection")
+        if timeout_s > 0.0:
+            select.select([self._listener], [], [], timeout_s)
+        try:
+            peer, _ = self._listener.accept()
+        except (BlockingIOError, ConnectionAbortedError):
+            return None
+        peer.setblocking(False)
+        _at_once(peer)
+        self._peer = peer
+        return peer
+
+    def _parted(self, why: str) -> PeerLost:
+        if self._peer is not None:
+            self._peer.close()
+            self._peer = None
+        self._lost = why
+        return PeerLost(self.name, why)
+
+
+def _at_once(sock: socket.socket) -> None:
+    # A control loop's frames must not wait in the kernel to be joined with later ones.
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -1,0 +1,179 @@
+"""UDP: one datagram is one message in the air; nobody ever says goodbye."""
+
+from __future__ import annotations
+
+import errno
+import ipaddress
+import select
+import socket
+from typing import Any
+
+from bridge.errors import LinkClosed, LinkUrlError, PortBusy
+from bridge.link import Link
+
+_LARGEST = 65_535
+
+# (host, port) or, for IPv6, (host, port, flow, scope): the socket module's own shape.
+Address = tuple[Any, ...]
+
+
+class UdpLink(Link):
+    """A UDP socket that is either listening or speaking to a fixed address.
+
+    - `listen`: answers the peer that spoke last. A ground station that comes back from another port is
+      answered there at once; two of them at the same time would take turns, so give each a link.
+    - `to`: speaks to one address from the first moment. With a local port it does as PX4 does: others may
+      talk to that port and the latest of them is answered too, in addition to the fixed address, so neither a
+      ground station that listens on the remote port nor a script that calls the local one waits in vain.
+
+    A peer that does not exist costs nothing but `dropped` (on loopback the system reports it, elsewhere it
+    cannot).
+    """
+
+    def __init__(self, name: str, sock: socket.socket, remote: Address | None, *, open_port: bool) -> None:
+        super().__init__(name)
+        sock.setblocking(False)
+        self._socket: socket.socket | None = sock
+        self._remote = remote
+        self._open_port = open_port
+        self._guest: Address | None = None
+
+    @classmethod
+    def listen(cls, host: str, port: int) -> UdpLink:
+        """Bind `host:port` and wait to be spoken to; port 0 takes a free one (see `port`).
+
+        Raises:
+            PortBusy: another program holds the port.
+            LinkUrlError: the host is not one of this computer's.
+        """
+        sock, _ = _bound("udpin", host, port)
+        return cls(f"udpin://{host}:{sock.getsockname()[1]}", sock, None, open_port=True)
+
+    @classmethod
+    def to(cls, host: str, port: int, *, local_port: int | None = None) -> UdpLink:
+        """Speak to `host:port`, from `local_port` if given.
+
+        Raises:
+            PortBusy: another program holds the local port.
+            LinkUrlError: the host cannot be found.
+        """
+        url = f"udpout://{host}:{port}"
+        family, remote = resolve(url, host, port, socket.SOCK_DGRAM)
+        if local_port is None:
+            return cls(url, socket.socket(family, socket.SOCK_DGRAM), remote, open_port=False)
+        # A vehicle that speaks to this computer only is reachable from this computer only.
+        if ipaddress.ip_address(remote[0].partition("%")[0]).is_loopback:
+            own = remote[0]
+        else:
+            own = "::" if family == socket.AF_INET6 else "0.0.0.0"
+        sock, _ = _bound("udpout", own, local_port)
+        return cls(f"{url}?local={local_port}", sock, remote, open_port=True)
+
+    @property
+    def port(self) -> int:
+        """The local port."""
+        return int(self._open().getsockname()[1])
+
+    def send(self, data: bytes) -> None:
+        """Send one datagram to the remote address and to the guest, if there are any."""
+        sock = self._open()
+        if self._remote is None and self._guest is None:
+            self.dropped += 1
+        for peer in (self._remote, self._guest):
+            if peer is not None:
+                try:
+                    sock.sendto(data, peer)
+                except OSError as error:
+                    self._count(error)
+
+    def recv(self, timeout_s: float = 0.0) -> bytes | None:
+        """Return the next datagram from anybody who may speak here."""
+        sock = self._open()
+        if timeout_s > 0.0:
+            select.select([sock], [], [], timeout_s)
+        while True:
+            try:
+                data, sender = sock.recvfrom(_LARGEST)
+            except BlockingIOError:
+                return None
+            except OSError as error:
+                self._count(error)
+                continue
+            if sender == self._remote:
+                return data
+            if self._open_port:
+                self._guest = sender
+                return data
+            # Somebody else found the port of a link that speaks to one address only.
+
+    def close(self) -> None:
+        """Release the port."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _open(self) -> socket.socket:
+        if self._socket is None:
+            raise LinkClosed(self.name)
+        return self._socket
+
+    def _count(self, error: OSError) -> None:
+        """Count what UDP reports about a datagram that went nowhere; anything else is a bug and goes up."""
+        if error.errno not in _NOBODY_THERE:
+            raise error
+        self.dropped += 1
+
+
+_NOBODY_THERE = {
+    errno.ECONNREFUSED,
+    errno.ECONNRESET,
+    errno.EHOSTUNREACH,
+    errno.ENETUNREACH,
+    errno.EHOSTDOWN,
+    errno.ENETDOWN,
+    errno.EAGAIN,
+    errno.ENOBUFS,
+    errno.EPERM,  # a firewall's answer to sendto
+}
+
+
+def resolve(url: str, host: str, port: int, kind: socket.SocketKind) -> tuple[socket.AddressFamily, Address]:
+    """Return the first address a host name stands for.
+
+    Raises:
+        LinkUrlError: no such host.
+    """
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=kind)[0]
+    except (OSError, UnicodeError) as error:
+        raise LinkUrlError(url, f"host {host!r} cannot be found ({error})", "Check its spelling") from None
+    return family, address
+
+
+def bind(url: str, sock: socket.socket, address: Address) -> None:
+    """Bind a socket, or close it and say why that is not possible.
+
+    Raises:
+        PortBusy: another program holds the port.
+        LinkUrlError: not an address of this computer, or not allowed.
+    """
+    try:
+        sock.bind(address)
+    except OSError as error:
+        sock.close()
+        host, port = str(address[0]), int(address[1])
+        if error.errno == errno.EADDRINUSE:
+            raise PortBusy(host, port) from None
+        if error.errno in (errno.EACCES, errno.EPERM):
+            remedy = "Choose a port from 1024 up"
+        else:
+            remedy = f"Listen on an address of this computer, 127.0.0.1 or 0.0.0.0 ({error.strerror})"
+        raise LinkUrlError(url, f"cannot listen on {host}:{port}", remedy) from None
+
+
+def _bound(scheme: str, host: str, port: int) -> tuple[socket.socket, Address]:
+    url = f"{scheme}://{host}:{port}"
+    family, address = resolve(url, host, port, socket.SOCK_DGRAM)
+    sock = socket.socket(family, socket.SOCK_DGRAM)
+    bind(url, sock, address)
+    return sock, address

@@ -1,0 +1,1 @@
+"""The flights: scenarios, gain sets, runner, metrics, recordings."""

@@ -1,0 +1,315 @@
+"""Gain sets: PX4 parameters to try, from TOML or QGroundControl's `.params`, and the checks before they go up."""
+
+from __future__ import annotations
+
+import difflib
+import importlib.resources
+import math
+import re
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sitl.errors import FileError, UsageError
+
+if TYPE_CHECKING:
+    from sitl.parameters import ParameterTable
+
+BUILT_IN = "gain_sets"
+SET_KEYS = ("name", "source", "note", "parameters")
+
+GAIN = re.compile(r"MC_(ROLL|PITCH|YAW)(RATE)?_(P|I|D|FF|K)$")
+"""Parameters that are gains: a negative one is positive feedback, never a candidate."""
+
+ABSURD_FACTOR = 100.0  # times PX4's maximum: a slipped decimal point or a wrong unit, not a candidate
+FLOAT32_MAX = 3.4028234663852886e38
+ABSURD = 1e3  # for gains whose metadata states no maximum
+
+PITCH_TWIN = {
+    "MC_ROLL_P": "MC_PITCH_P",
+    "MC_ROLLRATE_P": "MC_PITCHRATE_P",
+    "MC_ROLLRATE_I": "MC_PITCHRATE_I",
+    "MC_ROLLRATE_D": "MC_PITCHRATE_D",
+    "MC_ROLLRATE_FF": "MC_PITCHRATE_FF",
+    "MC_ROLLRATE_K": "MC_PITCHRATE_K",
+    "MC_ROLLRATE_MAX": "MC_PITCHRATE_MAX",
+    "MC_RR_INT_LIM": "MC_PR_INT_LIM",
+}
+
+
+@dataclass(frozen=True)
+class GainSet:
+    """A named candidate.
+
+    Attributes:
+        name: shown in tables; unique among the sets of a run.
+        parameters: PX4 parameter -> value, in the parameter's own unit.
+        source: where the numbers come from.
+        note: anything a reader of the result should know.
+        path: the file it was read from.
+    """
+
+    name: str
+    parameters: Mapping[str, float | int]
+    source: str = ""
+    note: str = ""
+    path: Path | None = None
+
+    @property
+    def slug(self) -> str:
+        """The name as a file name: lower case letters, digits, `_` and `-`."""
+        return re.sub(r"[^a-z0-9-]+", "_", self.name.lower()).strip("_")[:80] or "set"
+
+    def mirrored(self) -> GainSet:
+        """The same gains on pitch as well, but for pitch parameters that the set states itself."""
+        twins = {PITCH_TWIN[name]: value for name, value in self.parameters.items() if name in PITCH_TWIN}
+        parameters = dict(self.parameters) | {n: v for n, v in twins.items() if n not in self.parameters}
+        return GainSet(self.name, parameters, self.source, self.note, self.path)
+
+
+def list_gain_sets() -> tuple[str, ...]:
+    """Names of the gain set files that come with the program."""
+    return tuple(sorted(p.name.removesuffix(".toml") for p in _library().iterdir() if p.name.endswith(".toml")))
+
+
+def load_gain_sets(ref: str | Path) -> tuple[GainSet, ...]:
+    """The sets a reference names.
+
+    Args:
+        ref: `table_7_2` (every set of a built-in file), `table_7_2/ANT-R` (one of them), a path to a `.toml` or
+            QGroundControl `.params` file, or `path.toml/NAME`. A set answers to its name, its slug, or its name
+            without the first word, in any case.
+
+    Raises:
+        FileError: no such file or set, unreadable, a misspelt key, a value that is not a finite number.
+    """
+    text = str(ref)
+    head, _, tail = text.rpartition("/")
+    file, wanted = (head, tail) if _find(text) is None and _find(head) is not None else (text, "")
+    sets = _read_file(file)
+    if not wanted:
+        return sets
+    for gain_set in sets:
+        short = gain_set.name.partition(" ")[2]
+        if wanted.casefold() in (gain_set.name.casefold(), gain_set.slug, short.casefold()):
+            return (gain_set,)
+    names = [gain_set.name for gain_set in sets]
+    raise FileError(file, f"has no gain set {wanted!r}", f"{_near(wanted, names)}It has: {', '.join(names)}")
+
+
+def load_all(refs: Iterable[str | Path]) -> tuple[GainSet, ...]:
+    """Sets of several references, in order.
+
+    Raises:
+        FileError: as `load_gain_sets`, or two sets whose names or file names are the same.
+    """
+    sets = tuple(gain_set for ref in refs for gain_set in load_gain_sets(ref))
+    first: dict[str, GainSet] = {}
+    for gain_set in sets:
+        other = first.setdefault(gain_set.slug, gain_set)
+        if other is not gain_set:
+            raise FileError(
+                gain_set.path or "gain sets",
+                f"gain set {gain_set.name!r} has the same name as {other.name!r} of {other.path}",
+                "Name it once, or rename one: results and files are told apart by it",
+            )
+    return sets
+
+
+def check(gain_set: GainSet, table: ParameterTable) -> list[str]:
+    """Compare a set with the vehicle's parameter metadata before anything is uploaded.
+
+    Returns:
+        Warnings, one line each: values outside PX4's range, which PX4 takes without complaint and so do we.
+
+    Raises:
+        FileError: unknown parameter, NaN or infinity, a fraction for an INT32, a negative gain, or a gain so large
+            that it must be a slip (over 100 times PX4's maximum; over 1000 where it states none).
+    """
+    warnings = []
+    for name, value in gain_set.parameters.items():
+        if name not in table:
+            raise _bad(gain_set, f"unknown parameter {name!r}", _near(name, table.names) + "Remove or correct it")
+        spec = table.spec(name)
+        if not math.isfinite(value):
+            raise _bad(gain_set, f"{name} = {value} is not a finite number", "Write a number")
+        if spec.type == "INT32" and not isinstance(value, int):
+            raise _bad(gain_set, f"{name} = {value!r}, but it is an INT32", f"Write {round(value)}")
+        if spec.type != "INT32" and abs(value) > FLOAT32_MAX:
+            raise _bad(gain_set, f"{name} = {value:g} does not fit a float32", "Write a smaller number")
+        if spec.type == "INT32" and not -(2**31) <= value < 2**31:
+            raise _bad(gain_set, f"{name} = {value} does not fit 32 bits", "Write a smaller number")
+        if GAIN.match(name):
+            if value < 0:
+                raise _bad(gain_set, f"{name} = {value:g} is negative", "Gains are zero or more")
+            ceiling = ABSURD if spec.maximum is None else ABSURD_FACTOR * spec.maximum
+            if value > min(ceiling, ABSURD):
+                known = "" if spec.maximum is None else f"; PX4's maximum is {spec.maximum:g}"
+                raise _bad(
+                    gain_set,
+                    f"{name} = {value:g} is absurd{known}",
+                    f"Not flown above {min(ceiling, ABSURD):g}: check the decimal point and the unit",
+                )
+        if spec.maximum is not None and value > spec.maximum:
+            warnings.append(f"{name} {value:g} {_over(value, spec.maximum, 'maximum')}; flown anyway")
+        elif spec.minimum is not None and value < spec.minimum:
+            warnings.append(f"{name} {value:g} {_over(value, spec.minimum, 'minimum')}; flown anyway")
+    return warnings
+
+
+def _over(value: float, bound: float, which: str) -> str:
+    if bound > 0 and value > 0:
+        return f"is {value / bound:.3g} x PX4's {which} {bound:g}"
+    return f"is {abs(value - bound):g} beyond PX4's {which} {bound:g}"
+
+
+def save_params(
+    path: str | Path,
+    parameters: Mapping[str, float | int],
+    table: ParameterTable | None = None,
+    *,
+    sysid: int = 1,
+    compid: int = 1,
+) -> None:
+    """Write QGroundControl's parameter file: id, id, name, value, type (6 INT32, 9 REAL32), tab separated.
+
+    A float is written as the shortest decimal that reads back as the same float32.
+
+    Args:
+        path: of the file.
+        parameters: name -> value.
+        table: says which are INT32; without it, or for a name it lacks, the Python type does.
+        sysid: vehicle id written on each line.
+        compid: component id written on each line.
+
+    Raises:
+        FileError: cannot be written.
+    """
+    import numpy as np
+
+    lines = ["# Parameters written by froude", "#", "# Vehicle-Id Component-Id Name Value Type"]
+    for name, value in parameters.items():
+        known = table is not None and name in table
+        integer = table.spec(name).type == "INT32" if table is not None and known else isinstance(value, int)
+        text = str(int(value)) if integer else str(np.float32(value))
+        lines.append(f"{sysid}\t{compid}\t{name}\t{text}\t{6 if integer else 9}")
+    try:
+        Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise FileError(path, f"cannot be written: {error.strerror}", "Choose another place") from error
+
+
+def _library() -> Any:
+    return importlib.resources.files("scenarios") / BUILT_IN
+
+
+def _find(file: str) -> Path | None:
+    """The file of that path, or the built-in file of that name; None if there is neither."""
+    for path in (Path(file), Path(str(_library() / f"{file}.toml"))):
+        if file and path.is_file():
+            return path
+    return None
+
+
+def _read_file(file: str) -> tuple[GainSet, ...]:
+    path = _find(file)
+    if path is None:
+        known = list_gain_sets()
+        hint = f"{_near(file.partition('/')[0], known)}Built in: {', '.join(known)}; or give a .toml or .params file"
+        raise FileError(file, "no such gain set file", hint)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise FileError(path, f"cannot be read: {error}", "It must be a UTF-8 text file") from error
+    if path.suffix == ".params":
+        return (_from_params(text, path),)
+    if path.suffix == ".toml":
+        return _from_toml(text, path)
+    raise FileError(path, f"suffix {path.suffix!r} is not known", "Give a .toml or a QGroundControl .params file")
+
+
+def _from_toml(text: str, path: Path) -> tuple[GainSet, ...]:
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise FileError(path, f"is not TOML: {error}", "Correct the line") from error
+    for key in data:
+        if key != "gain_set":
+            raise FileError(path, f"unknown key {key!r}", "Every set is a [[gain_set]] table")
+    entries = data.get("gain_set")
+    if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
+        raise FileError(path, "holds no [[gain_set]]", "Write [[gain_set]] with name and [gain_set.parameters]")
+    sets = tuple(_set_from_table(entry, path, n) for n, entry in enumerate(entries, 1))
+    slugs = [gain_set.slug for gain_set in sets]
+    for gain_set in sets:
+        if slugs.count(gain_set.slug) > 1:
+            raise FileError(path, f"two gain sets are named {gain_set.name!r}", "Rename one")
+    return sets
+
+
+def _set_from_table(entry: dict[str, Any], path: Path, number: int) -> GainSet:
+    for key in entry:
+        if key not in SET_KEYS:
+            keys = f"{_near(key, SET_KEYS)}Keys are {', '.join(SET_KEYS)}"
+            raise FileError(path, f"gain_set {number}: unknown key {key!r}", keys)
+    for key in ("name", "source", "note"):
+        if not isinstance(entry.get(key, ""), str):
+            raise FileError(path, f"gain_set {number}: {key} = {entry[key]!r} is not a text", "Quote it")
+    name = entry.get("name", "").strip()
+    if not name:
+        raise FileError(path, f"gain_set {number} has no name", 'Write name = "..."')
+    parameters = entry.get("parameters")
+    if not isinstance(parameters, dict) or not parameters:
+        raise FileError(path, f"gain set {name!r} has no parameters", "Write [gain_set.parameters] MC_ROLL_P = 6.5")
+    for key, value in parameters.items():
+        _number(value, path, f"gain set {name!r}: {key}")
+    return GainSet(name, dict(parameters), entry.get("source", ""), entry.get("note", ""), path)
+
+
+def _number(value: Any, path: Path, what: str) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise FileError(path, f"{what} = {value!r} is not a number", "Write a number without quotes")
+    if not math.isfinite(value):
+        raise FileError(path, f"{what} = {value} is not a finite number", "Write a number")
+
+
+def _from_params(text: str, path: Path) -> GainSet:
+    parameters: dict[str, float | int] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        words = line.split()
+        if len(words) != 5:
+            raise FileError(
+                path,
+                f"line {number}: {len(words)} columns instead of 5",
+                "QGroundControl writes: vehicle id, component id, name, value, type",
+            )
+        _, _, name, value, kind = words
+        if name in parameters:
+            raise FileError(path, f"line {number}: {name} is given twice", "Remove one")
+        try:
+            if kind == "6":
+                parameters[name] = int(value)
+            elif kind == "9":
+                parameters[name] = float(value)
+            else:
+                raise FileError(path, f"line {number}: {name} has type {kind!r}", "PX4 knows 6 (INT32), 9 (REAL32)")
+        except ValueError:
+            what = "an integer" if kind == "6" else "a number"
+            raise FileError(path, f"line {number}: {name} = {value!r} is not {what}", "Correct it") from None
+        _number(parameters[name], path, f"line {number}: {name}")
+    if not parameters:
+        raise FileError(path, "holds no parameter", "Save it from QGroundControl: Parameters, Tools, Save to file")
+    return GainSet(path.stem, parameters, f"QGroundControl parameter file {path.name}", "", path)
+
+
+def _bad(gain_set: GainSet, problem: str, remedy: str) -> UsageError:
+    return FileError(gain_set.path or "gain set", f"gain set {gain_set.name!r}: {problem}", remedy)
+
+
+def _near(word: str, known: Sequence[str]) -> str:
+    match = difflib.get_close_matches(word, known, n=1)
+    return f"Did you mean {match[0]!r}? " if match else ""

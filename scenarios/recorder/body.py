@@ -1,0 +1,154 @@
+"""The vehicle in space: body, rotors and path in the viewer's east-north-up world.
+
+PX4's frames have z down (north-east-down, forward-right-down); here everything is turned over once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenarios.recorder.stream import TIMELINE, Colour, Recording
+
+PATH_STRIDE = 25
+"""Every so many rows a corner of the path."""
+ARROW_DIAGONALS = 0.7
+"""Length of a full-thrust arrow, in diagonals of the frame."""
+
+
+class RotorPlace(Protocol):
+    """What is needed of a rotor: its hub in the body (forward, right, down), m, and its moment ratio."""
+
+    @property
+    def px_m(self) -> float: ...  # noqa: D102
+    @property
+    def py_m(self) -> float: ...  # noqa: D102
+    @property
+    def pz_m(self) -> float: ...  # noqa: D102
+    @property
+    def km(self) -> float: ...  # noqa: D102
+
+
+class BodyView:
+    """Draws one vehicle into a recording.
+
+    Args:
+        recording: where to.
+        rotors: at least one, in motor order.
+        colours: one per motor, the same as in the motors' plot.
+    """
+
+    def __init__(self, recording: Recording, rotors: Sequence[RotorPlace], colours: Sequence[Colour]) -> None:
+        import rerun as rr
+
+        self._recording = recording
+        self._corners: list[NDArray[np.float64]] = []
+        hubs = np.array([(rotor.px_m, -rotor.py_m, -rotor.pz_m) for rotor in rotors])
+        diagonal = 2.0 * float(np.max(np.hypot(hubs[:, 0], hubs[:, 1]))) or 1.0
+        self._arrow_m = ARROW_DIAGONALS * diagonal
+        grey = (150, 150, 150)
+        stream = recording.stream
+        stream.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        stream.log(
+            "/world/body/arms",
+            rr.LineStrips3D(
+                [[(0.0, 0.0, 0.0), tuple(hub)] for hub in hubs], radii=0.02 * diagonal, colors=[grey]
+            ),
+            static=True,
+        )
+        stream.log(
+            "/world/body/rotors",
+            rr.Cylinders3D(
+                lengths=[0.02 * diagonal] * len(hubs),
+                radii=[0.2 * diagonal] * len(hubs),
+                centers=hubs,
+                colors=list(colours),
+                fill_mode="solid",
+            ),
+            static=True,
+        )
+        stream.log(
+            "/world/body/front",
+            rr.Arrows3D(
+                vectors=[(0.45 * diagonal, 0.0, 0.0)],
+                colors=[(235, 235, 235)],
+                radii=0.02 * diagonal,
+                labels=["front"],
+            ),
+            static=True,
+        )
+        stream.log(
+            "/world/body/thrust",
+            rr.Arrows3D.from_fields(origins=hubs, colors=list(colours), radii=0.015 * diagonal),
+            static=True,
+        )
+
+    def rows(
+        self,
+        time_s: NDArray[np.float64],
+        columns: Mapping[str, NDArray[Any]],
+        enu_m: NDArray[np.float64],
+        motors: NDArray[np.float64],
+    ) -> None:
+        """Move the body.
+
+        Args:
+            time_s: (n,) on the timeline.
+            columns: telemetry with `phi_rad`, `theta_rad`, `psi_rad`.
+            enu_m: (n, 3) position east, north, up.
+            motors: (n, rotors) commands 0 to 1, drawn as arrows.
+        """
+        import rerun as rr
+
+        stream = self._recording.stream
+        index = [rr.TimeColumn(TIMELINE, duration=time_s)]
+        quat = enu_quaternions(columns["phi_rad"], columns["theta_rad"], columns["psi_rad"])
+        stream.send_columns(
+            "/world/body",
+            index,
+            rr.Transform3D.columns(translation=enu_m, quaternion=quat[:, (1, 2, 3, 0)]),
+        )
+        arrows = np.zeros((*motors.shape, 3))
+        arrows[:, :, 2] = np.nan_to_num(motors) * self._arrow_m
+        stream.send_columns(
+            "/world/body/thrust",
+            index,
+            rr.Arrows3D.columns(vectors=arrows.reshape(-1, 3)).partition([motors.shape[1]] * len(time_s)),
+        )
+        self._corners.extend(enu_m[::PATH_STRIDE])
+        stream.set_time(TIMELINE, duration=float(time_s[0]))
+        stream.log(
+            "/world/path", rr.LineStrips3D([np.array(self._corners)], colors=[(86, 180, 233)], radii=[0.004])
+        )
+
+
+def enu_quaternions(phi: NDArray[Any], theta: NDArray[Any], psi: NDArray[Any]) -> NDArray[np.float64]:
+    """Attitude of the body (forward-left-up) in the world (east-north-up).
+
+    Args:
+        phi: (n,) roll, rad, of the body (forward-right-down) in north-east-down.
+        theta: (n,) pitch, rad.
+        psi: (n,) heading, rad.
+
+    Returns:
+        (n, 4) quaternions, w x y z.
+    """
+    # Turning both frames over keeps roll, mirrors pitch, and counts heading anticlockwise from east.
+    half_roll = 0.5 * np.asarray(phi, dtype=np.float64)
+    half_pitch = -0.5 * np.asarray(theta, dtype=np.float64)
+    half_yaw = 0.5 * (0.5 * math.pi - np.asarray(psi, dtype=np.float64))
+    cr, sr = np.cos(half_roll), np.sin(half_roll)
+    cp, sp = np.cos(half_pitch), np.sin(half_pitch)
+    cy, sy = np.cos(half_yaw), np.sin(half_yaw)
+    return np.column_stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )

@@ -1,0 +1,243 @@
+"""The result of a run as text: one row per gain set, then the reasons, the assumptions and where to look.
+
+A value that could not be measured is shown as "–"; its reason stands below the table.
+"""
+
+from __future__ import annotations
+
+import math
+import shlex
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from scenarios.flight import FlightRecord, RunRecord
+from scenarios.limits import Metric, Outcome
+
+UNSET = "–"
+MINIMUM_WIDTH = 80
+PIPED_WIDTH = 120
+"""Columns used where the output is not a terminal and COLUMNS does not say otherwise."""
+
+
+@dataclass(frozen=True)
+class TableColumn:
+    """One column of the result table.
+
+    Attributes:
+        title: heading; "/" breaks the line in a terminal.
+        unit: shown under the heading; empty for none.
+        metrics: names of the metrics in a cell, the first decides the cell's colour.
+        cell: text of the metrics' values, in that order.
+    """
+
+    title: str
+    unit: str
+    metrics: tuple[str, ...]
+    cell: Callable[..., str]
+
+
+def number(value: float | None, decimals: int = 2) -> str:
+    """A value for people: fixed decimals, "–" for none, "∞" for an infinite margin."""
+    if value is None or math.isnan(value):
+        return UNSET
+    if math.isinf(value):
+        return "∞" if value > 0 else "-∞"
+    text = f"{value:.{decimals}f}"
+    return text.removeprefix("-") if not text.strip("-0.") else text
+
+
+def _fixed(decimals: int, factor: float = 1.0) -> Callable[[float | None], str]:
+    return lambda value: number(None if value is None else value * factor, decimals)
+
+
+def _oscillation(amplitude: float | None, hertz: float | None) -> str:
+    if amplitude is None or hertz is None or amplitude < 0.05:
+        return number(amplitude)
+    return f"{number(amplitude)} @ {number(hertz, 1)}"
+
+
+COLUMNS: tuple[TableColumn, ...] = (
+    TableColumn("over-/shoot", "%", ("overshoot_pct",), _fixed(1)),
+    TableColumn("settle/5 %", "s", ("settling_time_5pct_s",), _fixed(2)),
+    TableColumn("settle/2 %", "s", ("settling_time_2pct_s",), _fixed(2)),
+    TableColumn("rise", "s", ("rise_time_s",), _fixed(3)),
+    TableColumn("droop", "deg", ("droop_deg",), _fixed(2)),
+    TableColumn("VAF", "%", ("vaf_pct",), _fixed(1)),
+    TableColumn("RMS/error", "deg", ("rms_error_deg",), _fixed(2)),
+    TableColumn("oscillation", "rad/s @ Hz", ("oscillation_rad_s", "oscillation_hz"), _oscillation),
+    TableColumn("peak/delta_lat", "", ("peak_delta_lat",), _fixed(2)),
+    TableColumn("delay/margin", "ms", ("delay_margin_s",), _fixed(1, 1000.0)),
+)
+
+STYLES: Mapping[Outcome, str] = {
+    Outcome.PASS: "green",
+    Outcome.FAIL: "red",
+    Outcome.UNSET: "yellow",
+    Outcome.INFO: "",
+}
+
+
+def cells(flight: FlightRecord) -> list[tuple[str, Outcome]]:
+    """Text and outcome of each of `COLUMNS` for one flight; the outcome is the worst of the cell's metrics."""
+    row = []
+    for column in COLUMNS:
+        metrics = [flight.metric(name) for name in column.metrics]
+        values = [None if metric is None else metric.value for metric in metrics]
+        first = metrics[0]
+        # Without a limit a metric that was not measured is no complaint: the dash says enough.
+        judged = first is not None and first.limit is not None
+        row.append((column.cell(*values), first.outcome if first is not None and judged else Outcome.INFO))
+    return row
+
+
+def _blank_reasons(flight: FlightRecord) -> dict[str, list[str]]:
+    """Why shown metrics have no value: reason -> titles of the columns."""
+    reasons: dict[str, list[str]] = {}
+    for column in COLUMNS:
+        metric: Metric | None = flight.metric(column.metrics[0])
+        if (
+            metric is not None
+            and metric.value is None
+            and metric.reason
+            and metric.reason not in flight.reason
+        ):
+            reasons.setdefault(metric.reason, []).append(column.title.replace("-/", "").replace("/", " "))
+    return reasons
+
+
+def notes(flight: FlightRecord) -> list[str]:
+    """What the row does not say by itself: the verdict's reason, why cells are empty, warnings."""
+    lines = [flight.reason] if flight.reason else []
+    lines += [f"{', '.join(titles)}: {UNSET}, {reason}" for reason, titles in _blank_reasons(flight).items()]
+    return lines + [f"warning: {warning}" for warning in flight.warnings]
+
+
+def own_gains_line(run: RunRecord) -> str:
+    """Whether the airframe's own flight gains fly under the run's assumptions; empty if that was not flown.
+
+    If they do not, the assumptions are wrong, and no candidate's verdict deserves trust.
+    """
+    flight = run.baseline
+    if flight is None:
+        return ""
+    name = flight.gain_set.name
+    if flight.outcome is Outcome.PASS or (
+        flight.outcome is Outcome.INFO and not flight.reason.startswith("not flown")
+    ):
+        return f"The airframe's own flight gains ({name}) fly under these assumptions: {flight.outcome}."
+    return (
+        f"The airframe's own flight gains ({name}) do not hold under these assumptions: {flight.outcome}, {flight.reason}. "
+        "They flew in reality, so doubt the assumptions before the candidates."
+    )
+
+
+def assumption_lines(run: RunRecord) -> list[str]:
+    """The fidelity profile and the vehicle's assumptions, as `item value unit` lines."""
+    lines = [f"{item} = {_plain(value)}{' ' + unit if unit else ''}" for item, value, unit in run.profile]
+    assumptions = run.vehicle.get("assumptions", {})
+    if isinstance(assumptions, Mapping):
+        lines += [f"{key} = {_plain(value)} (assumed)" for key, value in assumptions.items()]
+    return lines
+
+
+def _plain(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def run_text(
+    run: RunRecord, folder: Path | None = None, *, width: int | None = None, colour: bool = False
+) -> str:
+    """The whole result as text.
+
+    Args:
+        run: at least one flight, or none (an interrupted run).
+        folder: where the run's files are; None if nothing was kept.
+        width: columns to use; None for `PIPED_WIDTH`. Below `MINIMUM_WIDTH` the lines will be broken by the terminal.
+        colour: with ANSI colours; meaningful only on a terminal.
+
+    Returns:
+        Lines, with a newline at the end.
+    """
+    import io
+
+    from rich.console import Console
+
+    columns = max(width or PIPED_WIDTH, MINIMUM_WIDTH)
+    sink = io.StringIO()
+    console = Console(
+        file=sink,
+        width=columns,
+        force_terminal=colour,
+        color_system="standard" if colour else None,
+        highlight=False,
+        emoji=False,
+        markup=False,
+        legacy_windows=False,
+    )
+    console.print(_rich_table(run.flights))
+    for flight in run.flights:
+        for index, note in enumerate(notes(flight)):
+            lead = f"  {flight.gain_set.name}: " if index == 0 else "    "
+            console.print(_wrapped(lead + note, columns, "      "))
+    tail = []
+    own = own_gains_line(run)
+    if own:
+        tail.append(_wrapped(own, columns, "  "))
+    assumed = assumption_lines(run)
+    if assumed:
+        tail.append(_wrapped("Profile and assumptions: " + "; ".join(assumed) + ".", columns, "  "))
+    if not run.complete:
+        tail.append("The run was interrupted; flights that are not listed were not flown.")
+    if folder is not None:
+        # Paths stand alone on their line and are never wrapped: they are there to be copied.
+        tail.append(f"Run folder: {folder}")
+        tail.append(f"Look at it: rerun {shlex.quote(str(folder / 'compare.rrd'))}")
+    if tail:
+        console.print()
+        for line in tail:
+            console.print(line, soft_wrap=True)
+    return "\n".join(line.rstrip() for line in sink.getvalue().splitlines()) + "\n"
+
+
+def _wrapped(text: str, columns: int, indent: str) -> str:
+    return textwrap.fill(
+        text, columns, subsequent_indent=indent, break_on_hyphens=False, break_long_words=False
+    )
+
+
+def _rich_table(flights: Sequence[FlightRecord]) -> Any:
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
+    table.add_column("gain set", overflow="fold")
+    for column in COLUMNS:
+        title = column.title.replace("/", "\n")
+        table.add_column(f"{title}\n{column.unit}" if column.unit else title, justify="right", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    for flight in flights:
+        row = [Text(flight.gain_set.name)]
+        row += [Text(text, style=STYLES[outcome]) for text, outcome in cells(flight)]
+        table.add_row(*row, Text(str(flight.outcome), style=f"bold {STYLES[flight.outcome]}".strip()))
+    return table
+
+
+def terminal_width(stream: Any) -> tuple[int, bool]:
+    """Columns and whether colours are wanted for an output stream.
+
+    Colours only on a terminal, and not where NO_COLOR is set (no-color.org).
+    """
+    import os
+    import shutil
+
+    terminal = bool(getattr(stream, "isatty", lambda: False)())
+    width = (
+        shutil.get_terminal_size((PIPED_WIDTH, 24)).columns
+        if terminal or "COLUMNS" in os.environ
+        else PIPED_WIDTH
+    )
+    return width, terminal and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"

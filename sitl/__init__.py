@@ -1,0 +1,1 @@
+"""The vehicle: plant, sensors, autopilot. No MAVLink, no socket, no wall clock."""

@@ -1,0 +1,243 @@
+"""One compiled tick of the three-axis control chain: gyro sample in, motor commands out.
+
+Order within a tick, as a PX4 in lockstep has it: gyro filter, rate PID with the rate set-point of the tick before,
+allocation (the motors act from this sample on, held to the next), then the attitude law, whose rate set-point is used
+one tick later. The attitude it sees is a fraction of a tick late, as the estimator's is.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sitl.actuators import MAX_MOTORS, allocate, motor_output, saturation
+from sitl.attitude_control import attitude_control, linear_attitude_control
+from sitl.filters import biquad, settle_biquad
+from sitl.rate_control import rate_control
+from sitl.rotation import normalise, to_euler
+
+HISTORY = 8
+"""Attitudes remembered, hence the greatest lateness of the estimate in ticks is HISTORY - 2."""
+
+OFF, RATES, ATTITUDE = 0, 1, 2
+"""What the loop controls: nothing (motors stopped), body rates, attitude."""
+
+CONTROL_SETTINGS = np.dtype(
+    [
+        ("dt_s", "f8"),
+        ("low_pass", "f8", (5,)),
+        ("notches", "f8", (2, 5)),
+        ("notch_count", "i8"),
+        ("dgyro_alpha", "f8"),
+        ("att_gain", "f8", (3,)),
+        ("yaw_weight", "f8"),
+        ("rate_max", "f8", (3,)),
+        ("k", "f8", (3,)),
+        ("kp", "f8", (3,)),
+        ("ki", "f8", (3,)),
+        ("kd", "f8", (3,)),
+        ("kff", "f8", (3,)),
+        ("int_lim", "f8", (3,)),
+        ("yaw_torque_alpha", "f8"),
+        ("mix", "f8", (MAX_MOTORS, 4)),
+        ("inverse", "f8", (4, MAX_MOTORS)),
+        ("motor_count", "i8"),
+        ("method", "i8"),
+        ("airmode", "i8"),
+        ("slew_per_tick", "f8", (MAX_MOTORS,)),
+        ("thr_mdl_fac", "f8"),
+        ("status_ticks", "i8"),
+        ("attitude_late_ticks", "f8"),
+        ("rate_sp_late", "?"),
+        ("limits", "?"),
+        ("linear", "?"),
+    ],
+    align=True,
+)
+"""What a tick needs to know and never changes: gains, filter coefficients, mix (SI, rad, normalised torque)."""
+
+CONTROL_INPUT = np.dtype(
+    [
+        ("level", "i8"),
+        ("quat_sp", "f8", (4,)),
+        ("yaw_rate_sp", "f8"),
+        ("rates_sp", "f8", (3,)),
+        ("thrust_sp", "f8"),
+        ("landed", "?"),
+    ],
+    align=True,
+)
+"""What the modes ask of the loop; rates_sp counts at level RATES only."""
+
+CONTROL_STATE = np.dtype(
+    [
+        ("started", "?"),
+        ("low_pass", "f8", (3, 2)),
+        ("notches", "f8", (2, 3, 2)),
+        ("rates", "f8", (3,)),
+        ("accel", "f8", (3,)),
+        ("integral", "f8", (3,)),
+        ("positive", "u1", (3,)),
+        ("negative", "u1", (3,)),
+        ("status_age", "i8"),
+        ("attitudes", "f8", (HISTORY, 4)),
+        ("attitude", "f8", (4,)),
+        ("rates_sp", "f8", (3,)),
+        ("yaw_torque", "f8"),
+        ("torque_sp", "f8", (3,)),
+        ("motors", "f8", (MAX_MOTORS,)),
+        ("outputs", "f8", (MAX_MOTORS,)),
+    ],
+    align=True,
+)
+"""What a tick remembers; motors are commands in thrust space, outputs the signals sent to the motors."""
+
+
+@numba.njit(cache=True)
+def _filter_gyro(settings, state, gyro) -> None:  # type: ignore[no-untyped-def]
+    for axis in range(3):
+        sample = gyro[axis]
+        for i in range(settings.notch_count):
+            if not state.started:
+                settle_biquad(settings.notches[i], state.notches[i, axis], sample)
+            sample = biquad(settings.notches[i], state.notches[i, axis], sample)
+        if not state.started:
+            settle_biquad(settings.low_pass, state.low_pass[axis], sample)
+        rate = biquad(settings.low_pass, state.low_pass[axis], sample)
+        if state.started:
+            slope = (rate - state.rates[axis]) / settings.dt_s
+            state.accel[axis] += settings.dgyro_alpha * (slope - state.accel[axis])
+        state.rates[axis] = rate
+
+
+@numba.njit(cache=True)
+def _estimate_attitude(settings, state, quat) -> None:  # type: ignore[no-untyped-def]
+    if state.started:
+        for i in range(HISTORY - 1, 0, -1):
+            for j in range(4):
+                state.attitudes[i, j] = state.attitudes[i - 1, j]
+    for i in range(1 if state.started else HISTORY):
+        for j in range(4):
+            state.attitudes[i, j] = quat[j]
+    whole = int(settings.attitude_late_ticks)
+    part = settings.attitude_late_ticks - whole
+    a = state.attitudes[whole]
+    b = state.attitudes[min(whole + 1, HISTORY - 1)]
+    sign = 1.0 if a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] >= 0.0 else -1.0
+    q = normalise(
+        (
+            a[0] * (1.0 - part) + sign * b[0] * part,
+            a[1] * (1.0 - part) + sign * b[1] * part,
+            a[2] * (1.0 - part) + sign * b[2] * part,
+            a[3] * (1.0 - part) + sign * b[3] * part,
+        )
+    )
+    for j in range(4):
+        state.attitude[j] = q[j]
+
+
+@numba.njit(cache=True)
+def _attitude_law(settings, request, state) -> None:  # type: ignore[no-untyped-def]
+    if request.level == RATES:
+        for axis in range(3):
+            state.rates_sp[axis] = request.rates_sp[axis]
+        return
+    if request.level != ATTITUDE:
+        return
+    a = state.attitude
+    quat = (a[0], a[1], a[2], a[3])
+    s = request.quat_sp
+    quat_sp = (s[0], s[1], s[2], s[3])
+    gain = (settings.att_gain[0], settings.att_gain[1], settings.att_gain[2])
+    if not s[0] ** 2 + s[1] ** 2 + s[2] ** 2 + s[3] ** 2 > 0.0:
+        wanted = (math.nan, math.nan, math.nan)
+    elif settings.linear:
+        wanted = linear_attitude_control(to_euler(quat), to_euler(normalise(quat_sp)), gain)
+    else:
+        rate_max = (settings.rate_max[0], settings.rate_max[1], settings.rate_max[2])
+        wanted = attitude_control(quat, quat_sp, gain, settings.yaw_weight, rate_max, request.yaw_rate_sp)
+    for axis in range(3):
+        state.rates_sp[axis] = wanted[axis]
+
+
+@numba.njit(cache=True)
+def _rate_law(settings, request, state) -> None:  # type: ignore[no-untyped-def]
+    for axis in range(3):
+        if request.level == OFF:
+            state.integral[axis] = 0.0
+        torque, state.integral[axis] = rate_control(
+            state.rates[axis],
+            state.rates_sp[axis],
+            state.accel[axis],
+            state.integral[axis],
+            settings.k[axis],
+            settings.kp[axis],
+            settings.ki[axis],
+            settings.kd[axis],
+            settings.kff[axis],
+            settings.int_lim[axis],
+            state.positive[axis] != 0,
+            state.negative[axis] != 0,
+            request.landed or request.level == OFF,
+            settings.dt_s,
+        )
+        state.torque_sp[axis] = torque
+    state.yaw_torque += settings.yaw_torque_alpha * (state.torque_sp[2] - state.yaw_torque)
+    state.torque_sp[2] = state.yaw_torque
+
+
+@numba.njit(cache=True)
+def _allocation(settings, request, state) -> None:  # type: ignore[no-untyped-def]
+    n = settings.motor_count
+    if request.level == OFF:
+        for i in range(MAX_MOTORS):
+            state.motors[i] = 0.0
+            state.outputs[i] = 0.0
+        for axis in range(3):
+            state.positive[axis] = 0
+            state.negative[axis] = 0
+        return
+    if not settings.limits:
+        allocate(settings.mix, n, state.torque_sp, request.thrust_sp, 0, 0, state.motors)
+        for i in range(n):
+            state.outputs[i] = state.motors[i]
+        return
+    wanted = np.empty(MAX_MOTORS)
+    allocate(settings.mix, n, state.torque_sp, request.thrust_sp, settings.method, settings.airmode, wanted)
+    for i in range(n):
+        slew = settings.slew_per_tick[i]
+        value = min(state.motors[i] + slew, max(state.motors[i] - slew, wanted[i]))
+        state.motors[i] = min(1.0, max(0.0, value))
+        state.outputs[i] = motor_output(state.motors[i], settings.thr_mdl_fac)
+    state.status_age += 1
+    if state.status_age >= settings.status_ticks:
+        state.status_age = 0
+        saturation(settings.inverse, n, state.torque_sp, state.motors, state.positive, state.negative)
+
+
+@numba.njit(cache=True)
+def control_tick(settings_array, input_array, state_array, gyro: NDArray[np.float64], quat: NDArray[np.float64]) -> None:  # type: ignore[no-untyped-def]
+    """Run one tick of gyro filter, attitude law, rate law and allocation, in PX4's order.
+
+    Args:
+        settings_array: (1,) of CONTROL_SETTINGS.
+        input_array: (1,) of CONTROL_INPUT.
+        state_array: (1,) of CONTROL_STATE, updated in place; its ``outputs`` go to the motors.
+        gyro: (3,) measured body rates of this tick, rad/s.
+        quat: (4,) true attitude of this tick, body to world.
+    """
+    settings = settings_array[0]
+    request = input_array[0]
+    state = state_array[0]
+    _filter_gyro(settings, state, gyro)
+    _estimate_attitude(settings, state, quat)
+    state.started = True
+    if not settings.rate_sp_late:
+        _attitude_law(settings, request, state)
+    _rate_law(settings, request, state)
+    _allocation(settings, request, state)
+    if settings.rate_sp_late:
+        _attitude_law(settings, request, state)

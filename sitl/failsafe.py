@@ -1,0 +1,82 @@
+"""What PX4 does when the offboard signal is lost or the vehicle tips over.
+
+Source: PX4 ``commander/failsafe`` and ``commander/failure_detector``.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import Enum, auto
+
+from sitl.modes import Mode
+from sitl.parameters import ParameterTable
+
+_FLIGHT_TERMINATION_OFF = 121212
+
+
+class Action(Enum):
+    """What a failsafe asks for."""
+
+    HOLD = auto()
+    LAND = auto()
+    DISARM = auto()
+    TERMINATE = auto()
+
+
+ACTION_MODE = {Action.HOLD: Mode.LOITER, Action.LAND: Mode.LAND}
+
+
+def offboard_loss_action(parameters: ParameterTable) -> Action:
+    """What COM_OBL_RC_ACT asks for when the offboard signal is lost.
+
+    Position, Altitude and Stabilized need manual control, which this vehicle has not, so NAV_RCL_ACT decides as in
+    PX4; Return is not flown yet and falls back to Land, the next step of PX4's own ladder.
+    """
+    wanted = int(parameters.get("COM_OBL_RC_ACT"))
+    if wanted in (0, 1, 2):
+        by_rc_loss = {1: Action.HOLD, 2: Action.LAND, 3: Action.LAND, 5: Action.TERMINATE, 6: Action.DISARM}
+        return by_rc_loss.get(int(parameters.get("NAV_RCL_ACT")), Action.LAND)
+    return {5: Action.HOLD, 6: Action.TERMINATE, 7: Action.DISARM}.get(wanted, Action.LAND)
+
+
+class TiltDetector:
+    """PX4's failure detector for roll and pitch: beyond FD_FAIL_x for FD_FAIL_x_TTRI seconds.
+
+    Args:
+        parameters: the table.
+    """
+
+    def __init__(self, parameters: ParameterTable) -> None:
+        self._parameters = parameters
+        self._since_us: list[int | None] = [None, None]
+        self.failed = False
+
+    def update(self, now_us: int, phi: float, theta: float, watched: bool) -> None:
+        """Look once more.
+
+        Args:
+            now_us: vehicle time, us. phi: roll, rad. theta: pitch, rad.
+            watched: attitude control is on and the vehicle is armed.
+        """
+        if not watched:
+            self._since_us = [None, None]
+            self.failed = False
+            return
+        for axis, (name, angle) in enumerate((("R", phi), ("P", theta))):
+            limit = math.radians(float(self._parameters.get(f"FD_FAIL_{name}")))
+            since = self._since_us[axis]
+            if not limit > 0.0 or abs(angle) <= limit:
+                self._since_us[axis] = None
+            elif since is None:
+                self._since_us[axis] = now_us
+            elif now_us - since >= float(self._parameters.get(f"FD_FAIL_{name}_TTRI")) * 1e6:
+                self.failed = True
+        if self._since_us == [None, None]:
+            self.failed = False
+
+    def action(self, armed_for_us: int) -> Action | None:
+        """What to do about it: disarm just after arming, later terminate if CBRK_FLIGHTTERM allows, else nothing."""
+        get = self._parameters.get
+        if armed_for_us < (float(get("COM_SPOOLUP_TIME")) + float(get("COM_LKDOWN_TKO"))) * 1e6:
+            return Action.DISARM
+        return Action.TERMINATE if int(get("CBRK_FLIGHTTERM")) != _FLIGHT_TERMINATION_OFF else None

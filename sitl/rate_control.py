@@ -1,0 +1,65 @@
+"""PX4's rate PID, one axis. Source: PX4 ``lib/rate_control`` and ``mc_rate_control``."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+
+_I_FACTOR_RATE = math.radians(400.0)
+"""Rate error at which the integrator stops altogether, rad/s."""
+
+
+@numba.njit(cache=True)
+def rate_control(
+    rate: float,
+    rate_sp: float,
+    accel: float,
+    integral: float,
+    k: float,
+    kp: float,
+    ki: float,
+    kd: float,
+    kff: float,
+    int_lim: float,
+    positive_saturated: bool,
+    negative_saturated: bool,
+    frozen: bool,
+    dt_s: float,
+) -> tuple[float, float]:
+    """Torque set-point and next integrator state of one axis.
+
+    The integrator moves after the output is formed, one-sided while the allocator reports this axis saturated,
+    less and less as the error nears 400 deg/s, and not at all on the ground. K scales P, I and D, not FF.
+
+    Args:
+        rate: filtered body rate, rad/s.
+        rate_sp: its set-point, rad/s; not finite means no error.
+        accel: filtered derivative of the rate, rad/s^2.
+        integral: integrator state, normalised torque.
+        k: MC_xRATE_K. kp: MC_xRATE_P. ki: MC_xRATE_I. kd: MC_xRATE_D. kff: MC_xRATE_FF.
+        int_lim: MC_xR_INT_LIM, normalised torque; infinity for none.
+        positive_saturated: no more positive torque to be had. negative_saturated: nor negative.
+        frozen: landed or maybe landed.
+        dt_s: time since the last sample, s.
+
+    Returns:
+        (torque, integral): normalised torque set-point (not clamped), next integrator state.
+    """
+    if not math.isfinite(rate_sp):
+        rate_sp = rate
+    error = rate_sp - rate
+    torque = k * kp * error + integral - k * kd * accel + kff * rate_sp
+    if not frozen:
+        if positive_saturated:
+            error = min(error, 0.0)
+        if negative_saturated:
+            error = max(error, 0.0)
+        ratio = error / _I_FACTOR_RATE
+        factor = max(0.0, 1.0 - ratio * ratio) if math.isfinite(int_lim) else 1.0
+        moved = integral + factor * k * ki * error * dt_s
+        if math.isfinite(moved):
+            integral = min(int_lim, max(-int_lim, moved))
+    if not math.isfinite(torque):
+        torque = 0.0
+    return torque, integral

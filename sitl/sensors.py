@@ -1,0 +1,125 @@
+"""What the vehicle measures: IMU, magnetometer, barometer, GPS, from the plant's state plus seeded noise.
+
+The noise is drawn in blocks from one generator per vehicle and indexed by tick, so a reading depends on the seed and
+the tick alone, not on who looks at it or when. The gyro is quantised towards zero, as the 16-bit sensor of PX4's
+simulator is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from sitl.plant import G_M_S2, Plant
+from sitl.profile import Profile
+from sitl.rotation import to_body
+
+_BLOCK = 1024
+_EARTH_FIELD_GAUSS = (0.215, 0.006, 0.427)
+"""Magnetic field at the origin (Zurich), NED, gauss."""
+_METRES_PER_DEG = 111_319.49
+_GPS_PERIOD_US = 100_000
+
+ORIGIN = (47.397742, 8.545594, 488.0)
+"""PX4's customary home: latitude and longitude in deg, height above mean sea level in m."""
+
+
+@dataclass(frozen=True)
+class Gps:
+    """A position fix: degrees, metres above mean sea level, m/s NED, one-sigma accuracies in m."""
+
+    time_us: int
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+    vel_ned: tuple[float, float, float]
+    eph_m: float = 0.3
+    epv_m: float = 0.4
+    satellites: int = 12
+    fix_type: int = 3
+
+
+def geodetic(
+    position_ned: tuple[float, float, float], origin: tuple[float, float, float] = ORIGIN
+) -> tuple[float, float, float]:
+    """Latitude (deg), longitude (deg), height (m AMSL) of a NED position (m) on a locally flat earth."""
+    lat = origin[0] + position_ned[0] / _METRES_PER_DEG
+    lon = origin[1] + position_ned[1] / (_METRES_PER_DEG * math.cos(math.radians(origin[0])))
+    return lat, lon, origin[2] - position_ned[2]
+
+
+def pressure_hpa(alt_m: float) -> float:
+    """Pressure of the standard atmosphere, hPa, at a height in m AMSL."""
+    return float(1013.25 * (1.0 - 2.25577e-5 * alt_m) ** 5.25588)
+
+
+class Sensors:
+    """The sensors of one vehicle.
+
+    Args:
+        plant: what moves. profile: noise levels. seed: of the noise.
+    """
+
+    def __init__(self, plant: Plant, profile: Profile, seed: int) -> None:
+        self._plant = plant
+        self._profile = profile
+        self._rng = np.random.default_rng([seed, 1])
+        self._gps_rng = np.random.default_rng([seed, 2])
+        self._noise = np.zeros((_BLOCK, 10))
+        self._row = _BLOCK
+        self._scale = np.array(
+            [profile.gyro_noise_rad_s] * 3 + [profile.accel_noise_m_s2] * 3 + [profile.mag_noise_gauss] * 3 + [profile.baro_noise_hpa]
+        )
+        self._next_gps_us = 0
+        self.gyro = np.zeros(3)
+        self._gps = Gps(0, *ORIGIN, (0.0, 0.0, 0.0))
+
+    def sample(self, now_us: int) -> None:
+        """Read all sensors once; ``gyro`` (3,) rad/s is ready afterwards.
+
+        Args:
+            now_us: vehicle time, us.
+        """
+        self._row += 1
+        if self._row >= _BLOCK:
+            self._noise = self._rng.standard_normal((_BLOCK, 10)) * self._scale
+            self._row = 0
+        np.add(self._plant.rates, self._noise[self._row, :3], out=self.gyro)
+        quantum = self._profile.gyro_quantum_rad_s
+        if quantum > 0.0:
+            np.trunc(self.gyro / quantum, out=self.gyro)
+            self.gyro *= quantum
+        if now_us >= self._next_gps_us:
+            self._next_gps_us += _GPS_PERIOD_US
+            self._fix(now_us)
+
+    def _fix(self, now_us: int) -> None:
+        spread = self._gps_rng.standard_normal(6)
+        position = np.array(self._plant.position_ned()) + spread[:3] * self._profile.gps_noise_m
+        velocity = np.array(self._plant.velocity_ned()) + spread[3:] * self._profile.gps_noise_m_s
+        north, east, down = velocity.tolist()
+        self._gps = Gps(now_us, *geodetic(tuple(position.tolist())), (north, east, down))
+
+    def gps(self) -> Gps:
+        """The last fix (10 Hz)."""
+        return self._gps
+
+    def accel(self) -> tuple[float, float, float]:
+        """Specific force over the last tick, body axes, m/s^2; a_y is the study's output."""
+        x, y, z = (self._plant.force + self._noise[self._row % _BLOCK, 3:6]).tolist()
+        return x, y, z
+
+    def mag(self) -> tuple[float, float, float]:
+        """Magnetic field, body axes, gauss."""
+        field = to_body(tuple(self._plant.quat.tolist()), _EARTH_FIELD_GAUSS)
+        x, y, z = (np.array(field) + self._noise[self._row % _BLOCK, 6:9]).tolist()
+        return x, y, z
+
+    def pressure(self) -> float:
+        """Static pressure, hPa."""
+        return pressure_hpa(ORIGIN[2] - float(self._plant.x[2])) + float(self._noise[self._row % _BLOCK, 9])
+
+
+__all__ = ["G_M_S2", "ORIGIN", "Gps", "Sensors", "geodetic", "pressure_hpa"]
