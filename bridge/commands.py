@@ -1,8 +1,8 @@
 """Commands to the vehicle: COMMAND_LONG, COMMAND_INT and SET_MODE, each answered by one COMMAND_ACK.
 
 Rules are PX4's (src/modules/mavlink/mavlink_receiver.cpp, src/modules/commander/Commander.cpp) but for three:
-DO_SET_MODE is acknowledged once and not twice, a command that PX4 leaves unanswered for a payload that is not there
-is UNSUPPORTED, and what this vehicle does not fly is refused with a text that says so.
+DO_SET_MODE is acknowledged once and not twice, a command that PX4 leaves unanswered for a payload that is not
+there is UNSUPPORTED, and what this vehicle does not fly is refused with a text that says so.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from bridge.identity import REQUESTED
 from bridge.px4_modes import CUSTOM, PX4_MODES, Px4Mode, UnknownModeError, asked_mode, split_custom_mode
 from bridge.streams import HEARTBEAT_ID, STREAMS
-from sitl.modes import Mode, Result, Severity
+from sitl.modes import AVAILABLE, Mode, Result, Severity
 
 if TYPE_CHECKING:
     from bridge.vehicle_server import ServerLink, VehicleServer
@@ -71,7 +71,7 @@ class Command:
 
     Attributes:
         number: MAV_CMD.
-        params: param1 to param7; of a COMMAND_INT x and y are in degrees (or metres in a local frame), NaN for none.
+        params: param1 to param7; a COMMAND_INT's x and y in degrees (metres in a local frame), NaN for none.
         link: where it came in; requested messages go out there.
         frame: MAV_FRAME of a COMMAND_INT, None of a COMMAND_LONG (its altitude is above sea level).
     """
@@ -82,7 +82,7 @@ class Command:
     frame: int | None = None
 
     def whole(self, index: int) -> int:
-        """Return param`index` rounded as PX4 rounds (halves away from zero), NaN as 0, infinity as a large number."""
+        """Return param`index` rounded as PX4 does, halves away from zero; NaN is 0, infinity large."""
         value = self.params[index - 1]
         if value != value:
             return 0
@@ -119,7 +119,7 @@ class Commands:
             Cmd.GET_MESSAGE_INTERVAL: self._get_interval,
             Cmd.SET_MESSAGE_INTERVAL: self._set_interval,
             Cmd.REQUEST_MESSAGE: lambda command: self._request(command, command.whole(1), command.whole(2)),
-            **{number: self._old_request for number in _OLD_REQUESTS},
+            **dict.fromkeys(_OLD_REQUESTS, self._old_request),
         }
 
     def handle(self, link: ServerLink, msg: Any) -> None:
@@ -163,10 +163,10 @@ class Commands:
         return self._autopilot.command_arm(wish == 1, force=force)
 
     def _take_off(self, command: Command) -> Result:
-        altitude_m: float | None = command.params[6]
+        altitude_m = command.params[6]
         if not math.isfinite(altitude_m):
-            altitude_m = None
-        elif command.frame in _RELATIVE_FRAMES:
+            return self._autopilot.command_takeoff(None)
+        if command.frame in _RELATIVE_FRAMES:
             home = self._autopilot.home
             altitude_m += self._server.vehicle.origin[2] if home is None else home.alt_m
         return self._autopilot.command_takeoff(altitude_m)
@@ -188,9 +188,8 @@ class Commands:
         return Result.UNSUPPORTED
 
     def _switch(self, mode: Px4Mode) -> Result:
-        flown = {available.value for available in self._autopilot.AVAILABLE}
-        if mode.nav_state not in flown:
-            names = ", ".join(PX4_MODES[nav_state].name for nav_state in sorted(flown))
+        if mode.nav_state not in AVAILABLE:
+            names = ", ".join(PX4_MODES[available].name for available in AVAILABLE)
             self._server.say(Severity.CRITICAL, f"{mode.name} is not flown by this vehicle: {names} are")
             return Result.TEMPORARILY_REJECTED
         return self._autopilot.command_mode(Mode(mode.nav_state))

@@ -16,11 +16,13 @@ import difflib
 from collections.abc import Callable
 from typing import Any
 
-from bridge.framing import Counters, FrameSplitter, crc16
+from bridge.framing import MAGIC_2, Counters, FrameSplitter, crc16
 from bridge.messages import BY_ID, BY_NAME, Message
 from sitl.errors import UsageError
 
 __all__ = ["Connection", "Counters", "Message"]
+
+_MAGIC = bytes([MAGIC_2])
 
 
 class Connection:
@@ -76,10 +78,9 @@ class Connection:
         # MAVLink 2 cuts the zeros off the end but keeps one byte.
         payload = kind.pack(fields)
         payload = payload.rstrip(b"\0") or payload[:1]
-        body = (
-            bytes((len(payload), 0, 0, self.sent & 0xFF, self.sysid, self.compid)) + kind.id_bytes + payload
-        )
-        frame = b"\xfd" + body + crc16(kind.crc_extra, crc16(body)).to_bytes(2, "little")
+        head = bytes((len(payload), 0, 0, self.sent & 0xFF, self.sysid, self.compid))
+        body = head + kind.id_bytes + payload
+        frame = _MAGIC + body + crc16(kind.crc_extra, crc16(body)).to_bytes(2, "little")
         self.sent += 1
         if self.on_frame is not None:
             self.on_frame(frame)

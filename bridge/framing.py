@@ -18,14 +18,15 @@ frames are read; a frame with incompatibility flags we do not know is none. How 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from enum import Enum, auto
 
 import fastcrc
 
 from bridge.messages import Message, MessageType
 
-crc16 = fastcrc.crc16.mcrf4xx
+# CRC-16/MCRF4XX of the bytes, optionally going on from an earlier checksum.
+crc16: Callable[..., int] = fastcrc.crc16.mcrf4xx
 
 MAGIC_1 = 0xFE
 MAGIC_2 = 0xFD
@@ -58,8 +59,9 @@ class Counters:
     __slots__ = ("_last", "bad_bytes", "bad_crc", "late", "lost", "received", "resyncs", "unknown")
 
     def __init__(self) -> None:
-        self.received = self.bad_crc = self.unknown = self.bad_bytes = self.resyncs = self.lost = self.late =
-        0 self._last: dict[int, int] = {}
+        self.received = self.bad_crc = self.unknown = self.bad_bytes = 0
+        self.resyncs = self.lost = self.late = 0
+        self._last: dict[int, int] = {}
 
     def heard(self, sysid: int, compid: int, seq: int) -> None:
         """Follow the packet counter of one sender."""
@@ -79,8 +81,8 @@ class Counters:
         return (sysid << 8 | compid) in self._last
 
     def __repr__(self) -> str:
-        counts = ", ".join(f"{name} {getattr(self, name)}" for name in sorted(self.__slots__) if name[0] != "_")
-        return f"<Counters {counts}>"
+        names = [name for name in self.__slots__ if name[0] != "_"]
+        return f"<Counters {', '.join(f'{name} {getattr(self, name)}' for name in names)}>"
 
 
 class _Verdict(Enum):
@@ -107,6 +109,7 @@ class FrameSplitter:
         self._counters = counters
         self._datagram = datagram
         self._rest = b""
+        self._adrift = False
 
     @property
     def pending(self) -> int:
@@ -126,22 +129,27 @@ class FrameSplitter:
         self._rest = b""
         settled = 0
         while settled < len(buffer):
-            message = self._read(buffer, settled)
-            if not isinstance(message, Message):
-                message = self._search(buffer, settled, final)
-                if message is None:
+            result = self._read(buffer, settled)
+            if isinstance(result, Message):
+                message = result
+            else:
+                sought, settled = self._search(buffer, settled, final)
+                if sought is None:
                     break
-                settled = self._settled
+                message = sought
+            if self._adrift:
+                self._counters.resyncs += 1
+                self._adrift = False
             self._counters.received += 1
             self._counters.heard(message.sysid, message.compid, message.seq)
             found.append(message)
             settled += len(message.raw_frame)
         return found
 
-    def _search(self, buffer: bytes, settled: int, final: bool) -> Message | None:
-        """Find the next good frame after `settled`, where there is none; keep what may still become one.
+    def _search(self, buffer: bytes, settled: int, final: bool) -> tuple[Message | None, int]:
+        """Return the next good frame after `settled`, where there is none, and where it begins.
 
-        Sets `_settled` to where the frame begins.
+        Without one, keep what may still become one.
         """
         suspects: list[tuple[int, int, _Verdict]] = []
         keep: int | None = None
@@ -169,18 +177,18 @@ class FrameSplitter:
             limit = at
         else:
             limit = len(buffer) if keep is None else keep
-            if suspects and suspects[-1][0] < limit < suspects[-1][1]:
-                limit = suspects[-1][0]
+            # What straddles the limit is judged again when the rest is in.
+            limit = next((start for start, end, _ in suspects if start < limit < end), limit)
             self._rest = buffer[limit:]
-        self._give_up(buffer, settled, limit, suspects)
-        self._counters.resyncs += found is not None
-        self._settled = limit
-        return found
+        bad_bytes = self._give_up(buffer, settled, limit, suspects)
+        self._counters.bad_bytes += bad_bytes
+        self._adrift = self._adrift or bad_bytes > 0
+        return found, limit
 
     def _give_up(
         self, buffer: bytes, start: int, stop: int, suspects: list[tuple[int, int, _Verdict]]
-    ) -> None:
-        """Count the bytes from start to stop, in which there is no good frame."""
+    ) -> int:
+        """Count the frames from start to stop, none good; return the bytes that belong to no frame."""
         bad = stop - start
         for at, end, verdict in suspects:
             if at >= stop:
@@ -191,10 +199,11 @@ class FrameSplitter:
                 self._counters.unknown += 1
                 bad -= end - at
                 # It took a number from its sender's counter; a sender only ever seen here may be an accident.
-                seq, sysid, compid = buffer[at + 4 : at + 7] if buffer[at] == MAGIC_2 else buffer[at + 2 : at + 5]
+                head = at + 4 if buffer[at] == MAGIC_2 else at + 2
+                seq, sysid, compid = buffer[head : head + 3]
                 if self._counters.knows(sysid, compid):
                     self._counters.heard(sysid, compid, seq)
-        self._counters.bad_bytes += bad
+        return bad
 
     def _read(self, buffer: bytes, at: int) -> Message | tuple[_Verdict, int]:
         """Read the frame at this place, or say what is there instead and where it would end."""

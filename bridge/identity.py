@@ -11,6 +11,7 @@ from enum import IntFlag
 
 from bridge.px4_modes import PX4_MODES
 from bridge.telemetry import Fields, Source
+from sitl.modes import AVAILABLE
 
 
 class Capability(IntFlag):
@@ -39,8 +40,8 @@ CAPABILITIES = (
     | Capability.MAVLINK2
 )
 
-# The autopilot whose behaviour is copied, not this package's version: ground stations choose their PX4 version's
-# parameter descriptions by it. major << 24 | minor << 16 | patch << 8 | 255 for a release.
+# The autopilot whose behaviour is copied, not this package's version: ground stations choose their parameter
+# descriptions by it. major << 24 | minor << 16 | patch << 8 | 255 for a release.
 PX4_VERSION = 1 << 24 | 17 << 16 | 0 << 8 | 255
 
 _UID = 0x46524F554445_0000  # "FROUDE": no hardware behind it
@@ -71,9 +72,9 @@ def flight_information(source: Source, _: int) -> list[Fields]:
     return [{"time_boot_ms": source.time_ms}]
 
 
-def available_modes(source: Source, index: int) -> list[Fields]:
+def available_modes(_: Source, index: int) -> list[Fields]:
     """AVAILABLE_MODES (435): the modes this vehicle flies; index 0 = all of them, from 1 one of them."""
-    modes = [PX4_MODES[mode.value] for mode in source.vehicle.autopilot.AVAILABLE]
+    modes = [PX4_MODES[mode.value] for mode in AVAILABLE]
     return [
         {
             "number_modes": len(modes),

@@ -38,8 +38,8 @@ class Link(ABC):
     - `send` hands the bytes over or counts them in `dropped`; it never waits for a peer to appear.
     - `recv(timeout_s)` returns as soon as there is something, None after `timeout_s` at the latest; 0 never
       waits.
-    - A peer that goes away raises PeerLost from `send` or `recv`, once everything it had sent has been read.
-      UDP cannot see that and stays silent.
+    - A peer that goes away raises PeerLost: from `recv` once all it had sent has been read, from `send` at
+      once. UDP cannot see that and stays silent.
     - `close` may be repeated; using a closed link raises LinkClosed.
 
     Attributes:
@@ -307,15 +307,13 @@ def _address(url: str, parts: SplitResult) -> tuple[str, int]:
         port = parts.port
     except ValueError:
         raise LinkUrlError(url, "the port is not a number from 0 to 65535", remedy) from None
-    if port is None or parts.path not in ("", "/") or parts.username is not None:
-        raise LinkUrlError(
-            url, "no host and port in it" if port is None else "more than host and port", remedy
-        )
-    unknown = sorted({key for key, _ in parse_qsl(parts.query, keep_blank_values=True)} - {"local"})
-    if unknown or (parts.query and parts.scheme != "udpout"):
-        raise LinkUrlError(
-            url, f"unknown option {(unknown or ['local'])[0]!r}", "Only udpout takes ?local=port"
-        )
+    if port is None:
+        raise LinkUrlError(url, "no port in it", remedy)
+    if parts.path not in ("", "/") or parts.username is not None:
+        raise LinkUrlError(url, "there is more in it than host and port", remedy)
+    options = {key for key, _ in parse_qsl(parts.query, keep_blank_values=True)}
+    for option in sorted(options - {"local"} if parts.scheme == "udpout" else options):
+        raise LinkUrlError(url, f"unknown option {option!r}", "Only udpout takes one: ?local=port")
     return parts.hostname or LOOPBACK, port
 
 

@@ -62,15 +62,6 @@ class Field:
     offset: int
     size: int
 
-    @property
-    def zero(self) -> Any:
-        """The value a field has when nobody sets it."""
-        if self.type == "char":
-            return ""
-        if self.count:
-            return bytes(self.count) if self.type == "uint8_t" else (0,) * self.count
-        return 0.0 if self.type in ("float", "double") else 0
-
     def pack(self, value: Any) -> bytes:
         """Return the field's bytes; raises one of struct.error, OverflowError, TypeError, ValueError."""
         if isinstance(value, (bytes, bytearray, memoryview)) and len(value) == self.size:
@@ -81,10 +72,35 @@ class Field:
         if not self.count:
             return struct.pack("<" + _FORMATS[self.type], value)
         if self.type == "uint8_t":
-            return self._padded(bytes(memoryview(value)) if isinstance(value, bytearray) else bytes(tuple(value)))
+            return self._padded(bytes(tuple(value)))
         if len(value) != self.count:
             raise ValueError(f"{len(value)} elements, the field has {self.count}")
         return struct.pack(f"<{self.count}{_FORMATS[self.type]}", *value)
+
+    def packer(self) -> Callable[[Any], bytes]:
+        """Return the quickest way to pack an array's usual values; it may refuse some that `pack` takes.
+
+        Short bytes are returned as they are: the message's struct fills them up.
+        """
+        size = self.size
+        if self.type in ("char", "uint8_t"):
+
+            def pack_bytes(value: Any) -> bytes:
+                data: bytes = value.encode() if value.__class__ is str else value
+                if len(data) > size:
+                    raise ValueError
+                return data
+
+            return pack_bytes
+
+        numbers = struct.Struct(f"<{self.count}{_FORMATS[self.type]}").pack
+
+        def pack_numbers(value: Any) -> bytes:
+            if value.__class__ is bytes and len(value) == size:
+                return value
+            return numbers(*value)
+
+        return pack_numbers
 
     def unpack(self, data: bytes) -> Any:
         """Return the value of an array field's bytes."""
@@ -129,7 +145,7 @@ class MessageType:
     def __init__(self, definition: Any) -> None:
         self.name: str = definition.msgname
         self.id: int = definition.id
-        self.id_bytes = self.id.to_bytes(3, "little")
+        self.id_bytes: bytes = self.id.to_bytes(3, "little")
         self.crc_extra = bytes([definition.crc_extra])
         types = dict(zip(definition.fieldnames, definition.fieldtypes, strict=True))
         fields: list[Field] = []
@@ -144,9 +160,11 @@ class MessageType:
         self._struct = struct.Struct(layout)
         self.size = self._struct.size
         self._names = tuple(field.name for field in fields)
-        self._zeros = {field.name: field.zero for field in fields}
+        self._zeros = {field.name: bytes(field.size) if field.count else 0 for field in fields}
         self._arrays = tuple(
-            (index, field) for index, field in enumerate(fields) if field.type == "char" or field.count
+            (index, field.packer(), field.unpack)
+            for index, field in enumerate(fields)
+            if field.type == "char" or field.count
         )
         take: Callable[[Any], Any] = itemgetter(*self._names)
         self._take = take if len(fields) > 1 else lambda values: (take(values),)
@@ -169,8 +187,8 @@ class MessageType:
         try:
             if self._arrays:
                 items = list(items)
-                for index, field in self._arrays:
-                    items[index] = field.pack(items[index])
+                for index, pack, _ in self._arrays:
+                    items[index] = pack(items[index])
             return self._struct.pack(*items)
         except _FAILURES:
             # Raw bytes for a number, or a value that does not fit: field by field finds out which.
@@ -191,8 +209,8 @@ class MessageType:
             items = self._struct.unpack(frame[start:stop].ljust(self.size, b"\0"))
         if self._arrays:
             items = list(items)
-            for index, field in self._arrays:
-                items[index] = field.unpack(items[index])
+            for index, _, unpack in self._arrays:
+                items[index] = unpack(items[index])
         return dict(zip(self._names, items))  # noqa: B905  (the struct has one item per name)
 
     def _pack_one(self, field: Field, value: Any) -> bytes:

@@ -1,4 +1,4 @@
-"""ParamClient: the ground's side of MAVLink's parameter protocol, for a vehicle that may lose, double or delay packets.
+"""ParamClient: the ground's side of MAVLink's parameter protocol, made for links that lose and delay packets.
 
     client = ParamClient(target_system=1, target_component=1)
     operation = client.start_set("MC_ROLLRATE_P", 0.17, "REAL32", read_back=True)
@@ -9,114 +9,34 @@
             client.handle(message, now_us)
     operation.result.outcome    # VERIFIED, REFUSED, TIMEOUT or MISMATCH
 
-Messages in, messages out: no socket, no clock; `now_us` is vehicle time. A set is VERIFIED only when the vehicle has
-stated the very bits that were sent, after they were sent.
+Messages in, messages out: no socket, no clock; `now_us` is vehicle time. A set is VERIFIED only when the
+vehicle has stated the very bits that were sent, after they were sent.
 
-PARAM_VALUE carries no number of the request it answers, so an old answer to an old set looks like a new one. Where
-a name has lately held another value and held the wanted one before, answers do not count until every older packet
-must have died (LIFETIME_US).
+PARAM_VALUE does not say which request it answers, and a doubled PARAM_SET may arrive late. So a set waits
+until every packet of an older set of that parameter to another value must have died (LIFETIME_US), and where
+the wanted value was there before, its answers count only when the old ones must have died too. On links whose
+packets live no longer than that, VERIFIED means the vehicle holds the value.
 """
 
 from __future__ import annotations
 
-import enum
 from collections import deque
-from dataclasses import dataclass
 from typing import Final
 
 from bridge.messages import Message
+from bridge.param_operation import SILENT_TRIES, TIMEOUT_US, Outcome, ParamList, ParamOperation, ParamValue
 from bridge.param_protocol import HASH_NAME, NO_INDEX, TYPE_NUMBERS, Outgoing, ParamError
 from sitl.errors import UsageError
-from sitl.parameters import NAME_LENGTH, ParameterType, from_raw, to_raw
-
-TIMEOUT_US: Final = 500_000
-"""Time an answer may take before the request is sent again, us."""
+from sitl.parameters import NAME_LENGTH, ParameterType, to_raw
 
 LIFETIME_US: Final = 500_000
-"""Longest time a packet is taken to spend on its way, us."""
-
-SILENT_TRIES: Final = 5
-"""Sends after which a vehicle that answered nothing at all is given up; as many contrary answers are a mismatch."""
+"""Longest time a packet is taken to spend on its way, us of vehicle time."""
 
 TRIES: Final = 20
-"""Sends after which a vehicle that does answer other requests is given up on this one."""
-
-LIST_AGAIN: Final = 40
-"""More missing values than this are asked for by a new list, fewer one by one."""
+"""Sends after which one request is given up although the vehicle does answer others."""
 
 _TYPES: Final[dict[int, ParameterType]] = {number: type_ for type_, number in TYPE_NUMBERS.items()}
 _TRACE_LENGTH: Final = 16
-
-
-class Outcome(enum.Enum):
-    """How an operation ended."""
-
-    VERIFIED = "verified"
-    REFUSED = "refused"
-    TIMEOUT = "timeout"
-    MISMATCH = "mismatch"
-
-
-@dataclass(frozen=True, slots=True)
-class ParamValue:
-    """A value with its type; equal only if type and bits are."""
-
-    type: ParameterType
-    raw: bytes
-    """Four bytes, little-endian."""
-
-    @property
-    def value(self) -> int | float:
-        """As a Python number."""
-        return from_raw(self.type, self.raw)
-
-    def __str__(self) -> str:
-        return f"{self.value:.9g}" if self.type == "REAL32" else str(self.value)
-
-
-@dataclass(frozen=True, slots=True)
-class ParamResult:
-    """What became of one parameter."""
-
-    name: str
-    outcome: Outcome
-    wanted: ParamValue | None
-    """None for a read."""
-    seen: ParamValue | None
-    """The last value the vehicle stated since the operation began, None if it stated none."""
-    reason: str
-    """Why it is not VERIFIED, empty if it is."""
-    tries: int
-    """Times the request was sent."""
-
-
-class ParamOperation:
-    """A set or a read under way; `result` is None until it is `done`."""
-
-    __slots__ = ("contrary", "deadline_us", "differed", "name", "read_back", "reading", "result", "seen",
-                 "started_us", "tries", "trust_us", "wanted")  # fmt: skip
-
-    def __init__(self, name: str, wanted: ParamValue | None, read_back: bool) -> None:
-        self.name = name
-        self.wanted = wanted
-        self.read_back = read_back
-        self.reading = wanted is None  # asking for the value instead of setting it
-        self.result: ParamResult | None = None
-        self.seen: ParamValue | None = None
-        self.tries = 0
-        self.contrary = 0  # sends that a different value answered
-        self.differed = False  # a different value came since the last send
-        self.started_us = 0
-        self.deadline_us = 0
-        self.trust_us = 0  # before this an answer may be an older one's
-
-    @property
-    def done(self) -> bool:
-        """Whether it has ended."""
-        return self.result is not None
-
-    def _end(self, outcome: Outcome, reason: str = "") -> None:
-        self.result = ParamResult(self.name, outcome, self.wanted, self.seen, reason, self.tries)
 
 
 class ParamClient:
@@ -125,7 +45,7 @@ class ParamClient:
     Args:
         target_system: the vehicle.
         target_component: its component, 1 for an autopilot.
-        window: sets and reads in flight at once; different names only, the same name's go one after the other.
+        window: sets and reads in flight at once; those of one name go one after the other.
         own_system: our system; with it, refusals addressed to others are not taken for ours.
     """
 
@@ -142,9 +62,9 @@ class ParamClient:
         """Last `_HASH_CHECK` heard."""
         self._waiting: deque[ParamOperation] = deque()
         self._active: dict[str, ParamOperation] = {}
-        self._list: ReadAll | None = None
+        self._list: ParamList | None = None
         self._verified: dict[str, ParamValue] = {}
-        self._traces: dict[str, dict[ParamValue, int]] = {}  # values sent or heard, and when last
+        self._traces: dict[str, dict[ParamValue, int]] = {}  # by name, the values of `_note`
         self._refused_us: dict[str, int] = {}
         self._heard_us = -1
 
@@ -175,11 +95,11 @@ class ParamClient:
         """Begin to read one parameter; the value is `result.seen`. Raises UsageError as `start_set`."""
         return self._start(ParamOperation(name, None, False))
 
-    def start_read_all(self) -> ReadAll:
+    def start_read_all(self) -> ParamList:
         """Begin to read every parameter; one such reading at a time, a new one takes the old one's place."""
         if self._list is not None:
             self._list.end(Outcome.TIMEOUT, "a new reading was begun")
-        self._list = ReadAll(self.target_system, self.target_component)
+        self._list = ParamList(self.target_system, self.target_component, window=self.window)
         return self._list
 
     def drifted(self) -> dict[str, tuple[ParamValue, ParamValue]]:
@@ -247,22 +167,24 @@ class ParamClient:
         held: list[ParamOperation] = []
         while self._waiting and len(self._active) < self.window:
             operation = self._waiting.popleft()
-            if operation.name in self._active:
+            others_us = self._others_us(operation)
+            if operation.name in self._active or now_us < others_us:
                 held.append(operation)
                 continue
             self._active[operation.name] = operation
             operation.started_us = now_us
-            operation.trust_us = self._trust_us(operation, now_us)
+            known = operation.wanted in self._traces.get(operation.name, ())
+            operation.trust_us = others_us + LIFETIME_US if known else now_us
             self._send(operation, now_us, out)
         self._waiting.extendleft(reversed(held))
 
-    def _trust_us(self, operation: ParamOperation, now_us: int) -> int:
-        """From when on the wanted value, if heard, must be an answer to this operation."""
+    def _others_us(self, operation: ParamOperation) -> int:
+        """Latest time at which the vehicle may have taken, or stated, another value than a set wants."""
+        if operation.wanted is None:
+            return -LIFETIME_US
         trace = self._traces.get(operation.name, {})
-        if operation.wanted not in trace:
-            return now_us
         others = [time_us for value, time_us in trace.items() if value != operation.wanted]
-        return max([now_us] + [time_us + LIFETIME_US for time_us in others])
+        return max(others, default=-LIFETIME_US)
 
     def _send(self, operation: ParamOperation, now_us: int, out: list[Outgoing]) -> None:
         """Send or repeat the request of an operation, or end it when that has been done often enough."""
@@ -279,32 +201,27 @@ class ParamClient:
             out.append(("PARAM_REQUEST_READ", {**target, "param_id": operation.name, "param_index": -1}))
             return
         wanted = operation.wanted
-        self._note(operation.name, wanted, now_us)
-        out.append(
-            (
-                "PARAM_SET",
-                {
-                    **target,
-                    "param_id": operation.name,
-                    "param_value": wanted.raw,
-                    "param_type": TYPE_NUMBERS[wanted.type],
-                },
-            )
-        )
+        self._note(operation.name, wanted, now_us + LIFETIME_US)
+        fields = {
+            "param_id": operation.name,
+            "param_value": wanted.raw,
+            "param_type": TYPE_NUMBERS[wanted.type],
+        }
+        out.append(("PARAM_SET", {**target, **fields}))
 
     def _give_up(self, operation: ParamOperation, silent: bool) -> None:
         del self._active[operation.name]
-        seconds = operation.tries * TIMEOUT_US / 1e6
-        asked = f"asked {operation.tries} times in {seconds:g} s"
-        if operation.seen is not None and operation.seen != operation.wanted:
-            operation._end(Outcome.MISMATCH, f"the vehicle keeps {operation.seen} ({operation.seen.type}), {asked}")
-        elif operation.seen is not None:
-            operation._end(Outcome.TIMEOUT, f"echoed once, but the read-back had no answer, {asked}")
+        seen = operation.seen
+        asked = f"asked {operation.tries} times in {operation.tries * TIMEOUT_US / 1e6:g} s"
+        if seen is not None and seen != operation.wanted:
+            operation.end(Outcome.MISMATCH, f"the vehicle keeps {seen} ({seen.type}), {asked}")
+        elif seen is not None:
+            operation.end(Outcome.TIMEOUT, f"echoed once, but the read-back had no answer, {asked}")
         elif silent:
-            operation._end(Outcome.TIMEOUT, f"no answer, {asked}")
+            operation.end(Outcome.TIMEOUT, f"no answer, {asked}")
         else:
             hint = "an older autopilot says nothing to an unknown name or a wrong type"
-            operation._end(Outcome.TIMEOUT, f"no answer to this one, though to others, {asked}: {hint}")
+            operation.end(Outcome.TIMEOUT, f"no answer to this one, though to others, {asked}: {hint}")
 
     def _refused(self, name: str, code: int, now_us: int) -> None:
         """PARAM_ERROR: the operation of that name ends, unless the refusal may be an earlier one's."""
@@ -314,8 +231,9 @@ class ParamClient:
             return
         del self._active[name]
         self._refused_us[name] = now_us
-        what = ParamError(code).name.lower().replace("_", " ") if code in list(ParamError) else "unknown reason"
-        operation._end(Outcome.REFUSED, f"PARAM_ERROR {code} ({what})")
+        known = code in list(ParamError)
+        what = ParamError(code).name.lower().replace("_", " ") if known else "for an unknown reason"
+        operation.end(Outcome.REFUSED, f"PARAM_ERROR {code} ({what})")
 
     def _stated(self, name: str, value: ParamValue, now_us: int) -> None:
         """PARAM_VALUE: compare with what is wanted of that name."""
@@ -335,17 +253,16 @@ class ParamClient:
         operation.differed = False
         if operation.read_back and not operation.reading:
             operation.reading = True
-            operation.tries -= 1  # asking again is a new question, not a repeat
             operation.deadline_us = now_us
             return
         del self._active[name]
         if operation.wanted is not None:
             self._verified[name] = value
-        operation._end(Outcome.VERIFIED)
+        operation.end(Outcome.VERIFIED)
 
-    def _note(self, name: str, value: ParamValue, now_us: int) -> None:
+    def _note(self, name: str, value: ParamValue, time_us: int) -> None:
+        """Remember until when the vehicle may have taken or stated a value."""
         trace = self._traces.setdefault(name, {})
-        trace.pop(value, None)
-        trace[value] = now_us
+        trace[value] = max(time_us, trace.pop(value, time_us))
         if len(trace) > _TRACE_LENGTH:
             del trace[next(iter(trace))]

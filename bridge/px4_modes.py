@@ -69,8 +69,6 @@ PX4_MODES: dict[int, Px4Mode] = {
         Px4Mode(6, MAIN_POSITION, _SUB_POSITION_SLOW, "Position Slow", _BY_STICKS),
         Px4Mode(8, 11, 0, "Altitude Cruise", _BY_STICKS),
         Px4Mode(10, 5, 0, "Acro", CUSTOM | MANUAL),
-        # Descend has no number of its own: ground stations see Land.
-        Px4Mode(12, MAIN_AUTO, 6, "Descend", _BY_ITSELF, 7),
         Px4Mode(13, 10, 0, "Termination", CUSTOM, 0, 3),
         Px4Mode(14, 6, 0, "Offboard", _BY_SETPOINTS),
         Px4Mode(15, 7, 0, "Stabilized", _BY_STICKS),
@@ -80,6 +78,8 @@ PX4_MODES: dict[int, Px4Mode] = {
         Px4Mode(20, MAIN_AUTO, 9, "Precision Landing", _BY_ITSELF),
         Px4Mode(21, MAIN_POSITION, 1, "Orbit", _BY_SETPOINTS, 2),
         *(Px4Mode(23 + i, MAIN_AUTO, 11 + i, f"External {i + 1}", _BY_SETPOINTS) for i in range(8)),
+        # Descend has no number of its own: ground stations see Land, which therefore comes first here.
+        Px4Mode(12, MAIN_AUTO, 6, "Descend", _BY_ITSELF, 7),
     )
 }
 """Every mode a PX4 multicopter knows, by nav_state."""

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 
+from bridge.px4_modes import ARMED, CUSTOM
 from bridge.telemetry import (
     Fields,
     Source,
     int16,
     int32,
-    latitude_longitude,
     uint16,
     whole,
 )
-from bridge.px4_modes import ARMED, CUSTOM
+from sitl.sensors import geodetic
 
 _G = 9.80665
 _NAN = math.nan
@@ -125,7 +125,7 @@ def vibration(source: Source) -> Fields:
 
 def battery_status(source: Source) -> Fields:
     """BATTERY_STATUS: the pack's voltage in the first cell's place, as PX4 does without cell sensing."""
-    battery = source.vehicle.battery
+    battery = source.vehicle.battery()
     return {
         "battery_function": 1,
         "type": 1,
@@ -168,6 +168,7 @@ def hil_actuator_controls(source: Source) -> Fields:
         "time_usec": source.vehicle.time_us,
         "controls": [*motors, *[0.0] * (16 - len(motors))],
         "mode": CUSTOM | ARMED if autopilot.armed else CUSTOM,
+        "flags": 0,
     }
 
 
@@ -175,8 +176,7 @@ def hil_state_quaternion(source: Source) -> Fields:
     """HIL_STATE_QUATERNION: the true state: attitude, rates, place, velocity (cm/s), force (milli-g)."""
     vehicle = source.vehicle
     truth = vehicle.truth
-    north, east, down = truth.position_ned()
-    lat, lon = latitude_longitude(vehicle.origin, north, east)
+    lat, lon, altitude_m = geodetic(truth.position_ned(), vehicle.origin)
     p, q, r = truth.rates()
     vx, vy, vz = truth.velocity_ned()
     ax, ay, az = truth.accel_body()
@@ -189,7 +189,7 @@ def hil_state_quaternion(source: Source) -> Fields:
         "yawspeed": r,
         "lat": int32(lat * 1e7),
         "lon": int32(lon * 1e7),
-        "alt": int32((vehicle.origin[2] - down) * 1000.0),
+        "alt": int32(altitude_m * 1000.0),
         "vx": int16(vx * 100.0),
         "vy": int16(vy * 100.0),
         "vz": int16(vz * 100.0),

@@ -1,9 +1,9 @@
 """Which telemetry goes out on a link, and when.
 
-A `Schedule` keeps one due time per streamed message and a heap over them, so a tick on which nothing is due costs
-one comparison. Due times advance by whole intervals in microseconds of vehicle time: the achieved rate is the rate
-asked for, without drift, up to the vehicle's tick rate. Rates are PX4's (src/modules/mavlink/mavlink_main.cpp,
-configure_streams_to_default; ROMFS/px4fmu_common/init.d-posix/px4-rc.mavlink for what its simulator adds).
+A `Schedule` keeps one due time per streamed message and a heap over them, so a tick on which nothing is due
+costs one comparison. Due times advance by whole intervals in microseconds of vehicle time: the achieved rate
+is the rate asked for, without drift, up to the vehicle's tick rate. Rates are PX4's: mavlink_main.cpp's
+configure_streams_to_default, and for what its simulator adds init.d-posix/px4-rc.mavlink.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The fields of each telemetry message about attitude, place and status, from the vehicle's state this tick.
 
 One function per message: it takes a `Source` and returns the fields, or None when there is nothing to send.
-Sensors, actuators and time are in sensor_telemetry.py; who sends what how often is streams.py. Contents follow
-PX4's src/modules/mavlink/streams; every stamp is vehicle time.
+Sensors, actuators and time are in sensor_telemetry.py; who sends what how often is streams.py. Contents
+follow PX4's src/modules/mavlink/streams; every stamp is vehicle time.
 """
 
 from __future__ import annotations
@@ -12,14 +12,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bridge.px4_modes import ARMED, CUSTOM, OFFBOARD, PX4_MODES
+from sitl.sensors import geodetic
 from sitl.vehicle import Vehicle
 
 Fields = dict[str, Any]
 
-_EARTH_RADIUS_M = 6_371_000.0  # the sphere of PX4's map projection (src/lib/geo)
 _NAN = math.nan
 _MAV_AUTOPILOT_PX4 = 12
 _LOAD_PER_MILLE = 100
+_NO_OFFSET = (0.0, 0.0, 0.0, 0.0)  # all zero: not a tailsitter
 
 _POSITION_TARGET_MASK = {
     "x": 1,
@@ -113,24 +114,6 @@ def int32(value: float) -> int:
     return whole(value, -(2**31), 2**31 - 1)
 
 
-def latitude_longitude(
-    origin: tuple[float, float, float], north_m: float, east_m: float
-) -> tuple[float, float]:
-    """Return (lat_deg, lon_deg) of a place north and east of the origin.
-
-    Azimuthal equidistant on a sphere, as PX4's src/lib/geo; the origin itself for a place that is no place.
-    """
-    x, y = north_m / _EARTH_RADIUS_M, east_m / _EARTH_RADIUS_M
-    c = math.hypot(x, y)
-    lat0, lon0 = math.radians(origin[0]), math.radians(origin[1])
-    if not 0.0 < c < math.pi:
-        return origin[0], origin[1]
-    sin_c, cos_c = math.sin(c), math.cos(c)
-    sin_lat = cos_c * math.sin(lat0) + x * sin_c * math.cos(lat0) / c
-    lon = lon0 + math.atan2(y * sin_c, c * math.cos(lat0) * cos_c - x * math.sin(lat0) * sin_c)
-    return math.degrees(math.asin(max(-1.0, min(1.0, sin_lat)))), math.degrees(lon)
-
-
 def heartbeat(source: Source) -> Fields:
     """HEARTBEAT: who, which mode, armed or not."""
     autopilot = source.vehicle.autopilot
@@ -152,7 +135,7 @@ def heartbeat(source: Source) -> Fields:
 
 def sys_status(source: Source) -> Fields:
     """SYS_STATUS: every sensor there and healthy; PREARM_CHECK, in health alone, says it may be armed."""
-    battery = source.vehicle.battery
+    battery = source.vehicle.battery()
     return {
         "onboard_control_sensors_present": SENSORS,
         "onboard_control_sensors_enabled": SENSORS,
@@ -198,6 +181,7 @@ def attitude_quaternion(source: Source) -> Fields:
         "rollspeed": p,
         "pitchspeed": q,
         "yawspeed": r,
+        "repr_offset_q": _NO_OFFSET,
     }
 
 
@@ -207,6 +191,7 @@ def attitude_target(source: Source) -> Fields:
     p, q, r = attitude_sp.rates
     return {
         "time_boot_ms": source.vehicle.time_us // 1000,
+        "type_mask": 0,
         "q": attitude_sp.quat,
         "body_roll_rate": p,
         "body_pitch_rate": q,
@@ -244,9 +229,8 @@ def position_target_local_ned(source: Source) -> Fields:
 def global_position_int(source: Source) -> Fields:
     """GLOBAL_POSITION_INT: the estimate as latitude, longitude (1e-7 deg), altitude (mm), velocity (cm/s)."""
     vehicle = source.vehicle
-    north, east, _ = vehicle.estimate.position_ned()
+    lat, lon, _ = geodetic(vehicle.estimate.position_ned(), vehicle.origin)
     vx, vy, vz = vehicle.estimate.velocity_ned()
-    lat, lon = latitude_longitude(vehicle.origin, north, east)
     return {
         "time_boot_ms": source.time_ms,
         "lat": int32(lat * 1e7),

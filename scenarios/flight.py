@@ -1,4 +1,4 @@
-"""The record of a flight and of a run: what the runner fills, and every report, recording and file is made from."""
+"""The record of a flight and of a run: filled by the runner, read by every report and recording."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ class FlightRecord:
         segments: in order of time; the telemetry's `segment` column points into it.
         events: in order of time.
         metrics: of the whole flight (`segment` empty) and of each segment.
-        margins: loop margins of this gain set on this vehicle (`sitl.stability.Margins` as a mapping); empty if
-            not computed.
+        margins: loop margins of this gain set on this vehicle (`sitl.stability.Margins` as a mapping);
+            empty if not computed.
         outcome: the verdict, with `reason` in one line.
         warnings: out-of-range parameters and the like; flown anyway.
         telemetry_sha256: `telemetry.sha256()`.
@@ -106,8 +106,8 @@ class RunRecord:
         vehicle: the model's description: derivatives, sigma, scaling, assumptions.
         profile: every item of the fidelity profile as (item, value, unit).
         flights: one per gain set, in the order asked for.
-        baseline: the airframe's own flight gains, flown under the same assumptions; None if they are among `flights`
-            or not known. If they do not fly, the assumptions are wrong, not the candidates.
+        baseline: the airframe's own flight gains, flown under the same assumptions; None if they are among
+            `flights` or not known. If they do not fly, the assumptions are wrong, not the candidates.
         started_utc: ISO 8601; in no hash.
         versions: program and libraries.
         complete: False if the run was interrupted.

@@ -1,20 +1,21 @@
-"""Gain sets: PX4 parameters to try, from TOML or QGroundControl's `.params`, and the checks before they go up."""
+"""Gain sets: PX4 parameters to try, from TOML or QGroundControl's `.params`, checked before upload."""
 
 from __future__ import annotations
 
-import difflib
 import importlib.resources
 import math
 import re
-import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from scenarios.toml_file import read_toml
 from sitl.errors import FileError, UsageError
+from sitl.keyed_table import nearest
 
 if TYPE_CHECKING:
+    from sitl.airframe import FlightGains
     from sitl.parameters import ParameterTable
 
 BUILT_IN = "gain_sets"
@@ -24,7 +25,6 @@ GAIN = re.compile(r"MC_(ROLL|PITCH|YAW)(RATE)?_(P|I|D|FF|K)$")
 """Parameters that are gains: a negative one is positive feedback, never a candidate."""
 
 ABSURD_FACTOR = 100.0  # times PX4's maximum: a slipped decimal point or a wrong unit, not a candidate
-FLOAT32_MAX = 3.4028234663852886e38
 ABSURD = 1e3  # for gains whose metadata states no maximum
 
 PITCH_TWIN = {
@@ -69,18 +69,48 @@ class GainSet:
         return GainSet(self.name, parameters, self.source, self.note, self.path)
 
 
+def upload_parameters(
+    gain_set: GainSet, axes: str, flight_gains: FlightGains | None
+) -> dict[str, float | int]:
+    """Everything to upload for a flight: the gain set, and what pitch flies meanwhile.
+
+    With the same unstable gains on both axes PX4's desaturation cuts roll before pitch: the cycle lives in
+    pitch and roll looks clean. So pitch flies gains that are known to fly unless the set says otherwise.
+
+    Args:
+        gain_set: the candidate, roll.
+        axes: "roll": pitch flies the airframe's flight gains; "both": the set is mirrored to pitch.
+        flight_gains: of the airframe; None leaves pitch at what the vehicle has.
+    """
+    if axes == "both":
+        return dict(gain_set.mirrored().parameters)
+    if flight_gains is None:
+        return dict(gain_set.parameters)
+    pitch: dict[str, float | int] = {
+        "MC_PITCH_P": flight_gains.k_phi,
+        "MC_PITCHRATE_P": flight_gains.kp,
+        "MC_PITCHRATE_I": flight_gains.ki,
+        "MC_PITCHRATE_D": flight_gains.kd,
+        "MC_PITCHRATE_K": 1.0,
+        "MC_PITCHRATE_FF": 0.0,
+    }
+    return pitch | dict(gain_set.parameters)
+
+
 def list_gain_sets() -> tuple[str, ...]:
     """Names of the gain set files that come with the program."""
-    return tuple(sorted(p.name.removesuffix(".toml") for p in _library().iterdir() if p.name.endswith(".toml")))
+    return tuple(
+        sorted(p.name.removesuffix(".toml") for p in _library().iterdir() if p.name.endswith(".toml"))
+    )
 
 
 def load_gain_sets(ref: str | Path) -> tuple[GainSet, ...]:
     """The sets a reference names.
 
     Args:
-        ref: `table_7_2` (every set of a built-in file), `table_7_2/ANT-R` (one of them), a path to a `.toml` or
-            QGroundControl `.params` file, or `path.toml/NAME`. A set answers to its name, its slug, or its name
-            without the first word, in any case.
+        ref: `table_7_2` (every set of a built-in file), `table_7_2/ANT-R` (one of them), a path to a
+            `.toml` or QGroundControl `.params` file, or `path.toml/NAME`. A set answers to its name, its
+            slug, or its name without the first word, in any case.
 
     Raises:
         FileError: no such file or set, unreadable, a misspelt key, a value that is not a finite number.
@@ -96,7 +126,7 @@ def load_gain_sets(ref: str | Path) -> tuple[GainSet, ...]:
         if wanted.casefold() in (gain_set.name.casefold(), gain_set.slug, short.casefold()):
             return (gain_set,)
     names = [gain_set.name for gain_set in sets]
-    raise FileError(file, f"has no gain set {wanted!r}", f"{_near(wanted, names)}It has: {', '.join(names)}")
+    raise FileError(file, f'has no gain set "{wanted}"{nearest(wanted, names)}', f"It has {', '.join(names)}")
 
 
 def load_all(refs: Iterable[str | Path]) -> tuple[GainSet, ...]:
@@ -125,44 +155,40 @@ def check(gain_set: GainSet, table: ParameterTable) -> list[str]:
         Warnings, one line each: values outside PX4's range, which PX4 takes without complaint and so do we.
 
     Raises:
-        FileError: unknown parameter, NaN or infinity, a fraction for an INT32, a negative gain, or a gain so large
+        FileError: unknown parameter, NaN or infinity, a fraction for an INT32, a negative gain, or a gain
+        so large
             that it must be a slip (over 100 times PX4's maximum; over 1000 where it states none).
     """
+    from sitl.parameters import range_problem, to_raw
+
     warnings = []
     for name, value in gain_set.parameters.items():
         if name not in table:
-            raise _bad(gain_set, f"unknown parameter {name!r}", _near(name, table.names) + "Remove or correct it")
+            problem = f"unknown parameter {name}{nearest(name, table.names)}"
+            raise _bad(gain_set, problem, "Correct or remove it")
         spec = table.spec(name)
         if not math.isfinite(value):
             raise _bad(gain_set, f"{name} = {value} is not a finite number", "Write a number")
-        if spec.type == "INT32" and not isinstance(value, int):
-            raise _bad(gain_set, f"{name} = {value!r}, but it is an INT32", f"Write {round(value)}")
-        if spec.type != "INT32" and abs(value) > FLOAT32_MAX:
-            raise _bad(gain_set, f"{name} = {value:g} does not fit a float32", "Write a smaller number")
-        if spec.type == "INT32" and not -(2**31) <= value < 2**31:
-            raise _bad(gain_set, f"{name} = {value} does not fit 32 bits", "Write a smaller number")
+        try:
+            to_raw(name, spec.type, value)
+        except UsageError as error:
+            raise _bad(gain_set, str(error), "Correct the value") from error
         if GAIN.match(name):
-            if value < 0:
-                raise _bad(gain_set, f"{name} = {value:g} is negative", "Gains are zero or more")
-            ceiling = ABSURD if spec.maximum is None else ABSURD_FACTOR * spec.maximum
-            if value > min(ceiling, ABSURD):
-                known = "" if spec.maximum is None else f"; PX4's maximum is {spec.maximum:g}"
-                raise _bad(
-                    gain_set,
-                    f"{name} = {value:g} is absurd{known}",
-                    f"Not flown above {min(ceiling, ABSURD):g}: check the decimal point and the unit",
-                )
-        if spec.maximum is not None and value > spec.maximum:
-            warnings.append(f"{name} {value:g} {_over(value, spec.maximum, 'maximum')}; flown anyway")
-        elif spec.minimum is not None and value < spec.minimum:
-            warnings.append(f"{name} {value:g} {_over(value, spec.minimum, 'minimum')}; flown anyway")
+            _check_gain(gain_set, name, value, spec.maximum)
+        outside = range_problem(spec, value)
+        if outside:
+            warnings.append(f"{outside}; flown anyway")
     return warnings
 
 
-def _over(value: float, bound: float, which: str) -> str:
-    if bound > 0 and value > 0:
-        return f"is {value / bound:.3g} x PX4's {which} {bound:g}"
-    return f"is {abs(value - bound):g} beyond PX4's {which} {bound:g}"
+def _check_gain(gain_set: GainSet, name: str, value: float, maximum: float | None) -> None:
+    if value < 0:
+        raise _bad(gain_set, f"{name} = {value:g} is negative", "Gains are zero or more")
+    ceiling = ABSURD if maximum is None else min(ABSURD, ABSURD_FACTOR * maximum)
+    if value > ceiling:
+        known = "" if maximum is None else f" (PX4's maximum is {maximum:g})"
+        remedy = f"Nothing above {ceiling:g} is flown: check the decimal point and the unit"
+        raise _bad(gain_set, f"{name} = {value:g} is absurd{known}", remedy)
 
 
 def save_params(
@@ -217,30 +243,27 @@ def _read_file(file: str) -> tuple[GainSet, ...]:
     path = _find(file)
     if path is None:
         known = list_gain_sets()
-        hint = f"{_near(file.partition('/')[0], known)}Built in: {', '.join(known)}; or give a .toml or .params file"
-        raise FileError(file, "no such gain set file", hint)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileError(path, f"cannot be read: {error}", "It must be a UTF-8 text file") from error
+        hint = f"Built in: {', '.join(known)}; or give a .toml or .params file"
+        raise FileError(file, f"no such gain set file{nearest(file.partition('/')[0], known)}", hint)
     if path.suffix == ".params":
-        return (_from_params(text, path),)
+        return (_from_params(path),)
     if path.suffix == ".toml":
-        return _from_toml(text, path)
-    raise FileError(path, f"suffix {path.suffix!r} is not known", "Give a .toml or a QGroundControl .params file")
+        return _from_toml(path)
+    raise FileError(
+        path, f"suffix {path.suffix!r} is not known", "Give a .toml or a QGroundControl .params file"
+    )
 
 
-def _from_toml(text: str, path: Path) -> tuple[GainSet, ...]:
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise FileError(path, f"is not TOML: {error}", "Correct the line") from error
+def _from_toml(path: Path) -> tuple[GainSet, ...]:
+    data = read_toml(path)
     for key in data:
         if key != "gain_set":
             raise FileError(path, f"unknown key {key!r}", "Every set is a [[gain_set]] table")
     entries = data.get("gain_set")
     if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
-        raise FileError(path, "holds no [[gain_set]]", "Write [[gain_set]] with name and [gain_set.parameters]")
+        raise FileError(
+            path, "holds no [[gain_set]]", "Write [[gain_set]] with name and [gain_set.parameters]"
+        )
     sets = tuple(_set_from_table(entry, path, n) for n, entry in enumerate(entries, 1))
     slugs = [gain_set.slug for gain_set in sets]
     for gain_set in sets:
@@ -252,8 +275,8 @@ def _from_toml(text: str, path: Path) -> tuple[GainSet, ...]:
 def _set_from_table(entry: dict[str, Any], path: Path, number: int) -> GainSet:
     for key in entry:
         if key not in SET_KEYS:
-            keys = f"{_near(key, SET_KEYS)}Keys are {', '.join(SET_KEYS)}"
-            raise FileError(path, f"gain_set {number}: unknown key {key!r}", keys)
+            problem = f'gain_set {number}: unknown key "{key}"{nearest(key, SET_KEYS)}'
+            raise FileError(path, problem, f"Keys are {', '.join(SET_KEYS)}")
     for key in ("name", "source", "note"):
         if not isinstance(entry.get(key, ""), str):
             raise FileError(path, f"gain_set {number}: {key} = {entry[key]!r} is not a text", "Quote it")
@@ -262,7 +285,9 @@ def _set_from_table(entry: dict[str, Any], path: Path, number: int) -> GainSet:
         raise FileError(path, f"gain_set {number} has no name", 'Write name = "..."')
     parameters = entry.get("parameters")
     if not isinstance(parameters, dict) or not parameters:
-        raise FileError(path, f"gain set {name!r} has no parameters", "Write [gain_set.parameters] MC_ROLL_P = 6.5")
+        raise FileError(
+            path, f"gain set {name!r} has no parameters", "Write [gain_set.parameters] MC_ROLL_P = 6.5"
+        )
     for key, value in parameters.items():
         _number(value, path, f"gain set {name!r}: {key}")
     return GainSet(name, dict(parameters), entry.get("source", ""), entry.get("note", ""), path)
@@ -275,7 +300,11 @@ def _number(value: Any, path: Path, what: str) -> None:
         raise FileError(path, f"{what} = {value} is not a finite number", "Write a number")
 
 
-def _from_params(text: str, path: Path) -> GainSet:
+def _from_params(path: Path) -> GainSet:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise FileError(path, f"cannot be read: {error}", "It must be a UTF-8 text file") from error
     parameters: dict[str, float | int] = {}
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -296,20 +325,19 @@ def _from_params(text: str, path: Path) -> GainSet:
             elif kind == "9":
                 parameters[name] = float(value)
             else:
-                raise FileError(path, f"line {number}: {name} has type {kind!r}", "PX4 knows 6 (INT32), 9 (REAL32)")
+                raise FileError(
+                    path, f"line {number}: {name} has type {kind!r}", "PX4 knows 6 (INT32), 9 (REAL32)"
+                )
         except ValueError:
             what = "an integer" if kind == "6" else "a number"
             raise FileError(path, f"line {number}: {name} = {value!r} is not {what}", "Correct it") from None
         _number(parameters[name], path, f"line {number}: {name}")
     if not parameters:
-        raise FileError(path, "holds no parameter", "Save it from QGroundControl: Parameters, Tools, Save to file")
+        raise FileError(
+            path, "holds no parameter", "Save it from QGroundControl: Parameters, Tools, Save to file"
+        )
     return GainSet(path.stem, parameters, f"QGroundControl parameter file {path.name}", "", path)
 
 
 def _bad(gain_set: GainSet, problem: str, remedy: str) -> UsageError:
     return FileError(gain_set.path or "gain set", f"gain set {gain_set.name!r}: {problem}", remedy)
-
-
-def _near(word: str, known: Sequence[str]) -> str:
-    match = difflib.get_close_matches(word, known, n=1)
-    return f"Did you mean {match[0]!r}? " if match else ""

@@ -1,13 +1,12 @@
 """Measurements, the limits set on them, and the verdict.
 
-A metric is declared with its unit and limit, then measured. "Never measured" is not "failed": it is UNSET, with the
-reason.
+A metric is declared with its unit and limit, then measured. "Never measured" is not "failed": it is UNSET,
+with the reason.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,10 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from sitl.errors import FileError
+from sitl.keyed_table import nearest
 
 LIMIT_CYCLE_RAD_S = 0.3
-"""Standard deviation of a body rate over one second above which an axis is in a limit cycle. Uncritical: recorded
-flights show at most 0.037 when quiet and at least 0.62 when cycling."""
+"""Standard deviation of a body rate over one second above which an axis is in a limit cycle. Uncritical:
+recorded flights show at most 0.037 when quiet and at least 0.62 when cycling."""
 
 
 class Outcome(Enum):
@@ -52,8 +52,8 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "lag_s": ("s", "delay of the roll angle behind the set-point, by cross-correlation"),
     "vaf_lag_removed_pct": ("%", "variance accounted for once the lag is taken out"),
     "rms_error_deg": ("deg", "root mean square of set-point minus roll angle"),
-    "gain_margin_low_db": ("dB", "gain reduction that makes the loop unstable"),
-    "gain_margin_high_db": ("dB", "gain increase that makes the loop unstable"),
+    "gain_margin_low_db": ("dB", "lower end of the stable loop gains, relative to the present one"),
+    "gain_margin_high_db": ("dB", "upper end of the stable loop gains, relative to the present one"),
     "phase_margin_deg": ("deg", "of the loop broken at delta_lat"),
     "delay_margin_s": ("s", "extra delay that makes the loop unstable"),
     "modulus_margin": ("1", "least distance of the loop from -1"),
@@ -119,8 +119,8 @@ class Limit:
 
 
 STANDING = Limit("oscillation_rad_s", maximum=LIMIT_CYCLE_RAD_S)
-"""Applied to every flight unless the scenario limits the oscillation itself: no list of limits lets a vehicle pass
-that shakes."""
+"""Applied to every flight unless the scenario limits the oscillation itself: no list of limits lets a
+vehicle pass that shakes."""
 
 LIMIT_SETS: Mapping[str, tuple[Limit, ...]] = {
     "practical": (
@@ -147,7 +147,8 @@ def parse_limits(value: Any, path: str | Path, key: str = "limits") -> tuple[Lim
     """
     if isinstance(value, str):
         if value not in LIMIT_SETS:
-            raise FileError(path, f"{key} = {value!r} is not a limit set", f"Known: {', '.join(LIMIT_SETS)}")
+            problem = f'{key}: unknown limit set "{value}"{nearest(value, LIMIT_SETS)}'
+            raise FileError(path, problem, f"Sets are {', '.join(LIMIT_SETS)}")
         return LIMIT_SETS[value]
     if not isinstance(value, list):
         raise FileError(path, f"{key} = {value!r} is neither a name nor a list", 'Write limits = "practical"')
@@ -167,9 +168,8 @@ def _parse_limit(entry: Any, path: str | Path, key: str) -> Limit:
             raise FileError(path, f"{key}: unknown key {name!r}", "Keys are metric, min, max")
     name = entry["metric"]
     if name not in METRICS:
-        near = difflib.get_close_matches(str(name), METRICS, n=1)
-        hint = f"Did you mean {near[0]!r}?" if near else f"Known: {', '.join(METRICS)}"
-        raise FileError(path, f"{key}: unknown metric {name!r}", hint)
+        problem = f"{key}: unknown metric {name!r}{nearest(str(name), METRICS)}"
+        raise FileError(path, problem, f"Metrics are {', '.join(METRICS)}")
     for bound in ("min", "max"):
         number = entry.get(bound)
         if number is None:
@@ -194,15 +194,15 @@ def judge(
     Args:
         metrics: of the flight and its segments; limits apply to the flight's own (`segment` empty).
         limits: of the scenario; `STANDING` is added unless they limit the oscillation.
-        failure: why the flight itself failed (diverged, failsafe, refused, timed out); that is a FAIL whatever was
-            measured.
+        failure: why the flight itself failed (diverged, failsafe, refused, timed out); that is a FAIL
+            whatever was measured.
 
     Returns:
-        The outcome, the reason in one line (empty for PASS), and all metrics with limit and outcome filled in. FAIL
-        beats UNSET beats PASS. A limited metric that was not measured is UNSET. Without any limit a flight that
-        neither failed nor cycles is INFO.
+        The outcome, the reason in one line (empty for PASS), and all metrics with limit and outcome filled
+        in. FAIL beats UNSET beats PASS. A limited metric that was not measured is UNSET. Without any limit
+        a flight that neither failed nor cycles is INFO.
     """
-    applied = {limit.metric: limit for limit in ((STANDING, *limits) if limits else (STANDING,))}
+    applied = {limit.metric: limit for limit in (STANDING, *limits)}
     by_name = {metric.name: metric for metric in metrics if not metric.segment}
     checked: dict[str, Metric] = {}
     for name, limit in applied.items():

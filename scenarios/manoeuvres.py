@@ -240,11 +240,13 @@ def _multisine(keys: _Keys) -> list[Part]:
     duration_s, peak = keys.seconds("duration_s"), keys.degrees("peak_deg")
     frequencies, phases = keys.sines()
     fade_s = keys.fade(duration_s)
+    if len(set(frequencies)) < len(frequencies):
+        raise keys.table.error("frequencies_hz", "a frequency is given twice", "Give each once")
     return [Sines.with_peak(duration_s, peak, frequencies, phases, fade_s, keys.rate_hz)]
 
 
 def _track(keys: _Keys) -> list[Part]:
-    """Steps, ramps and a multisine in 20 s: our stand-in for the study's input (its figure 7.2 is not available)."""
+    """Steps, ramps and a multisine in 20 s: stands in for the study's figure 7.2, which is not available."""
     frequencies, phases = (0.25, 0.5, 0.9, 1.4, 2.0), (0.0, 2.1, 4.4, 1.2, 3.3)
     return [
         *(Ramp.level(1.0, 0), Ramp.level(1.5, 10), Ramp.level(1.5, -10), Ramp.level(1.0, 0)),
@@ -263,7 +265,8 @@ KINDS: Mapping[str, Callable[[_Keys], list[Part]]] = {
     "track": _track,
 }
 
-# Level after the signal, s, unless the file says otherwise: its last second shows whether the vehicle oscillates.
+# Level after the signal, s, unless the file says otherwise: its last second shows whether the vehicle
+# oscillates.
 RETURN_S = {"step": 3.0, "3211": 2.0, "ramp": 2.0, "chirp": 2.0, "multisine": 2.0, "track": 2.0}
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from scenarios.flight import FlightRecord, RunRecord
-from scenarios.limits import Metric, Outcome
+from scenarios.limits import LIMIT_CYCLE_RAD_S, Outcome
 
 UNSET = "–"
 MINIMUM_WIDTH = 80
@@ -37,6 +37,11 @@ class TableColumn:
     unit: str
     metrics: tuple[str, ...]
     cell: Callable[..., str]
+
+    @property
+    def name(self) -> str:
+        """The title on one line."""
+        return self.title.replace("-/", "").replace("/_", "_").replace("/", " ")
 
 
 def number(value: float | None, decimals: int = 2) -> str:
@@ -67,10 +72,18 @@ COLUMNS: tuple[TableColumn, ...] = (
     TableColumn("droop", "deg", ("droop_deg",), _fixed(2)),
     TableColumn("VAF", "%", ("vaf_pct",), _fixed(1)),
     TableColumn("RMS/error", "deg", ("rms_error_deg",), _fixed(2)),
-    TableColumn("oscillation", "rad/s @ Hz", ("oscillation_rad_s", "oscillation_hz"), _oscillation),
-    TableColumn("peak/delta_lat", "", ("peak_delta_lat",), _fixed(2)),
+    TableColumn("oscil-/lation", "rad/s @ Hz", ("oscillation_rad_s", "oscillation_hz"), _oscillation),
+    TableColumn("peak/delta/_lat", "", ("peak_delta_lat",), _fixed(2)),
     TableColumn("delay/margin", "ms", ("delay_margin_s",), _fixed(1, 1000.0)),
 )
+
+OWN_GAINS: Mapping[str, str] = {
+    "k_phi": "MC_ROLL_P",
+    "kp": "MC_ROLLRATE_P",
+    "ki": "MC_ROLLRATE_I",
+    "kd": "MC_ROLLRATE_D",
+}
+"""Names of an airframe's flight gains, and the parameters that carry them."""
 
 STYLES: Mapping[Outcome, str] = {
     Outcome.PASS: "green",
@@ -81,7 +94,7 @@ STYLES: Mapping[Outcome, str] = {
 
 
 def cells(flight: FlightRecord) -> list[tuple[str, Outcome]]:
-    """Text and outcome of each of `COLUMNS` for one flight; the outcome is the worst of the cell's metrics."""
+    """Text of each of `COLUMNS` for one flight, and the outcome of the cell's first metric."""
     row = []
     for column in COLUMNS:
         metrics = [flight.metric(name) for name in column.metrics]
@@ -93,26 +106,56 @@ def cells(flight: FlightRecord) -> list[tuple[str, Outcome]]:
     return row
 
 
-def _blank_reasons(flight: FlightRecord) -> dict[str, list[str]]:
-    """Why shown metrics have no value: reason -> titles of the columns."""
-    reasons: dict[str, list[str]] = {}
-    for column in COLUMNS:
-        metric: Metric | None = flight.metric(column.metrics[0])
-        if (
-            metric is not None
-            and metric.value is None
-            and metric.reason
-            and metric.reason not in flight.reason
-        ):
-            reasons.setdefault(metric.reason, []).append(column.title.replace("-/", "").replace("/", " "))
-    return reasons
-
-
 def notes(flight: FlightRecord) -> list[str]:
-    """What the row does not say by itself: the verdict's reason, why cells are empty, warnings."""
+    """Why it did not pass, and the warnings it was flown with."""
     lines = [flight.reason] if flight.reason else []
-    lines += [f"{', '.join(titles)}: {UNSET}, {reason}" for reason, titles in _blank_reasons(flight).items()]
     return lines + [f"warning: {warning}" for warning in flight.warnings]
+
+
+def blank_cells(flights: Sequence[FlightRecord]) -> list[str]:
+    """Why cells are empty: one line per reason, naming the columns and the gain sets."""
+    reasons: dict[tuple[str, tuple[str, ...]], list[str]] = {}
+    for flight in flights:
+        blanks: dict[str, list[str]] = {}
+        for column in COLUMNS:
+            metric = flight.metric(column.metrics[0])
+            if metric is not None and metric.value is None and metric.reason:
+                blanks.setdefault(metric.reason, []).append(column.name)
+        for reason, columns in blanks.items():
+            reasons.setdefault((reason, tuple(columns)), []).append(flight.gain_set.name)
+    return [
+        f"{UNSET} {', '.join(columns)} ({', '.join(sets)}): {reason}"
+        for (reason, columns), sets in reasons.items()
+    ]
+
+
+def own_flight(run: RunRecord) -> FlightRecord | None:
+    """The flight of the airframe's own gains: the baseline, or the candidate with the same roll gains."""
+    own = run.vehicle.get("flight_gains")
+    if run.baseline is not None or not own:
+        return run.baseline
+    wanted = {parameter: own[key] for key, parameter in OWN_GAINS.items()}
+    for flight in run.flights:
+        flown = flight.gain_set.parameters
+        neutral = flown.get("MC_ROLLRATE_K", 1.0) == 1.0 and flown.get("MC_ROLLRATE_FF", 0.0) == 0.0
+        if neutral and all(flown.get(name) == value for name, value in wanted.items()):
+            return flight
+    return None
+
+
+def own_gains_fly(flight: FlightRecord) -> bool:
+    """Did this flight, of the airframe's own gains, fly: nothing went wrong and nothing oscillates?
+
+    The scenario's other limits are for candidates; gains that flew may well be slow.
+    """
+    if flight.outcome is not Outcome.FAIL:
+        return flight.outcome is not Outcome.UNSET or _quiet(flight)
+    return _quiet(flight) and any(metric.outcome is Outcome.FAIL for metric in flight.metrics)
+
+
+def _quiet(flight: FlightRecord) -> bool:
+    metric = flight.metric("oscillation_rad_s")
+    return metric is not None and metric.value is not None and metric.value <= LIMIT_CYCLE_RAD_S
 
 
 def own_gains_line(run: RunRecord) -> str:
@@ -120,30 +163,33 @@ def own_gains_line(run: RunRecord) -> str:
 
     If they do not, the assumptions are wrong, and no candidate's verdict deserves trust.
     """
-    flight = run.baseline
+    flight = own_flight(run)
     if flight is None:
         return ""
     name = flight.gain_set.name
-    if flight.outcome is Outcome.PASS or (
-        flight.outcome is Outcome.INFO and not flight.reason.startswith("not flown")
-    ):
-        return f"The airframe's own flight gains ({name}) fly under these assumptions: {flight.outcome}."
+    if own_gains_fly(flight):
+        verdict = "" if not flight.reason else f" ({flight.outcome} here: {flight.reason})"
+        return f"The airframe's own flight gains ({name}) fly under these assumptions{verdict}."
     return (
-        f"The airframe's own flight gains ({name}) do not hold under these assumptions: {flight.outcome}, {flight.reason}. "
-        "They flew in reality, so doubt the assumptions before the candidates."
+        f"The airframe's own flight gains ({name}) do NOT fly under these assumptions: {flight.reason}. "
+        "They flew in reality: doubt the assumptions before the candidates."
     )
 
 
 def assumption_lines(run: RunRecord) -> list[str]:
-    """The fidelity profile and the vehicle's assumptions, as `item value unit` lines."""
-    lines = [f"{item} = {_plain(value)}{' ' + unit if unit else ''}" for item, value, unit in run.profile]
+    """Items of the fidelity profile and assumptions in force, as `item value`; units are in the names."""
+    profile = {item: value for item, value, _ in run.profile if value != "airframe"}
+    lines = [f"{item} {_plain(value)}" for item, value in profile.items() if item != "name"]
     assumptions = run.vehicle.get("assumptions", {})
-    if isinstance(assumptions, Mapping):
-        lines += [f"{key} = {_plain(value)} (assumed)" for key, value in assumptions.items()]
+    lines += [
+        f"{item} {_plain(value)} (assumed)" for item, value in assumptions.items() if item not in profile
+    ]
     return lines
 
 
 def _plain(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
@@ -155,7 +201,8 @@ def run_text(
     Args:
         run: at least one flight, or none (an interrupted run).
         folder: where the run's files are; None if nothing was kept.
-        width: columns to use; None for `PIPED_WIDTH`. Below `MINIMUM_WIDTH` the lines will be broken by the terminal.
+        width: columns to use; None for `PIPED_WIDTH`. Below `MINIMUM_WIDTH` the lines will be broken by the
+            terminal.
         colour: with ANSI colours; meaningful only on a terminal.
 
     Returns:
@@ -182,13 +229,15 @@ def run_text(
         for index, note in enumerate(notes(flight)):
             lead = f"  {flight.gain_set.name}: " if index == 0 else "    "
             console.print(_wrapped(lead + note, columns, "      "))
+    for line in blank_cells(run.flights):
+        console.print(_wrapped(f"  {line}", columns, "      "))
     tail = []
     own = own_gains_line(run)
     if own:
         tail.append(_wrapped(own, columns, "  "))
     assumed = assumption_lines(run)
     if assumed:
-        tail.append(_wrapped("Profile and assumptions: " + "; ".join(assumed) + ".", columns, "  "))
+        tail.append(_wrapped(f"Profile {run.scenario.profile}: " + ", ".join(assumed) + ".", columns, "  "))
     if not run.complete:
         tail.append("The run was interrupted; flights that are not listed were not flown.")
     if folder is not None:

@@ -1,11 +1,11 @@
 """What one flight looked like: columns of equal length, one row per ATTITUDE message of the vehicle.
 
-The set-point columns hold what the vehicle reports in ATTITUDE_TARGET, not what was sent: that is what is scored.
+The set-point columns hold what the vehicle reports in ATTITUDE_TARGET, not what was sent: that is what is
+scored.
 """
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import json
 from collections.abc import Mapping
@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sitl.errors import FileError, UsageError
+from sitl.keyed_table import nearest
 
 Array = npt.NDArray[Any]
 METADATA_KEY = b"froude"
@@ -71,7 +72,7 @@ _ALL = (
         _float(
             f"motor{n}",
             "1",
-            f"command of PX4's motor {n}, 0 to 1; NaN: no such motor (HIL_ACTUATOR_CONTROLS)",
+            f"command of PX4's motor {n}, 0 to 1; NaN: not reported (HIL_ACTUATOR_CONTROLS)",
         )
         for n in range(1, 9)
     ),
@@ -97,14 +98,12 @@ class Telemetry:
         """Cast to the schema; a column that is not given is filled with its `missing` value.
 
         Raises:
-            UsageError: no `t_s`, a name that is not in the schema, unequal lengths, or time that does not increase.
+            UsageError: no `t_s`, a name that is not in the schema, unequal lengths, or time that does not
+            increase.
         """
         for name in columns:
             if name not in COLUMNS:
-                near = difflib.get_close_matches(name, COLUMNS, n=1)
-                raise UsageError(
-                    f"telemetry has no column {name!r}" + (f"; nearest is {near[0]!r}" if near else "")
-                )
+                raise UsageError(f"telemetry has no column {name!r}{nearest(name, COLUMNS)}")
         if "t_s" not in columns:
             raise UsageError("telemetry needs the column 't_s'")
         rows = len(np.atleast_1d(np.asarray(columns["t_s"])))
@@ -145,8 +144,8 @@ class Telemetry:
     def sha256(self) -> str:
         """Fingerprint of the flight: SHA-256 of every column's little-endian bytes, in schema order.
 
-        Nothing else enters (no file bytes, date or version), so anyone can recompute it from the Parquet file. NaNs
-        are counted as the one quiet NaN, because their payload bits differ between processors.
+        Nothing else enters (no file bytes, date or version), so anyone can recompute it from the Parquet
+        file. NaNs are counted as the one quiet NaN, because their payload bits differ between processors.
         """
         digest = hashlib.sha256()
         for name, column in COLUMNS.items():

@@ -148,7 +148,7 @@ _BOARD = replace(_SITL, name="board", rate_hz=800, transport_delay_ticks=1)
 PROFILES: dict[str, Profile] = {profile.name: profile for profile in (_STUDY, _SITL, _BOARD)}
 
 
-def get_profile(name: str, **overrides: object) -> Profile:
+def get_profile(name: str, /, **overrides: object) -> Profile:
     """A profile by name, with single items replaced.
 
     Args:

@@ -9,8 +9,8 @@ Tick k of length dt, cut at delta_lat (everything right of "=" is of tick k unle
     I_k+1  = I_k + k ki (r - y) dt                       after the output
     torque = delta held over [k + d, k + d + 1) dt + T   through the motors' first-order lag
 
-Limits, noise and quantisation are left out: this is the loop around hover. d is the profile's transport delay in
-ticks, T a further one in seconds that need not be whole ticks; both enter exactly, by splitting the hold.
+Limits, noise and quantisation are left out: this is the loop around hover. d is the profile's transport delay
+in ticks, T a further one in seconds that need not be whole ticks; both enter exactly, by splitting the hold.
 """
 
 from __future__ import annotations
@@ -74,11 +74,12 @@ class SampledLoop:
     ) -> None:
         if not (motor_lag_s >= 0.0 and transport_delay_s >= 0.0):
             raise ValueError(
-                f"motor lag {motor_lag_s} s, transport delay {transport_delay_s} s: not negative"
+                f"motor lag {motor_lag_s} s, transport delay {transport_delay_s} s: must be 0 or more"
             )
         dt = profile.dt_s
         self.dt_s = dt
         self.gains = gains
+        self.motor_lag_s = motor_lag_s
         self.biquad = low_pass_2p(profile.gyro_cutoff_hz, profile.rate_hz)
         self.dgyro_alpha = alpha_of(profile.dgyro_cutoff_hz, dt)
         self.late = _late_weights(profile)
@@ -88,14 +89,20 @@ class SampledLoop:
         self.delay_ticks = profile.transport_delay_ticks + whole
         self.phi, self.held, self.previous = _discretise(derivatives, motor_lag_s, dt, fraction_s)
         self.delay_s = self.delay_ticks * dt + fraction_s + dt / 2.0 + motor_lag_s + _low_pass_delay(profile)
-        """Delay at low frequency of the rate loop's own elements: transport, half a tick of hold, motor lag, gyro
-        filter. The attitude path's lateness and the D filter are not in it: they delay only part of the signal."""
+        """Delay at low frequency of the rate loop's own elements: transport, half a tick of hold, motor lag,
+        gyro filter. The attitude's lateness and the D filter are not in it: they delay part of the signal."""
+
+    @property
+    def finite_at_zero(self) -> bool:
+        """Whether L has a value at frequency 0: no integrator, and no pole of the airframe at rest (Lv = 0)."""
+        at_rest = np.abs(np.linalg.eigvals(self.phi) - 1.0).min() < 1e-12
+        return self.gains.k * self.gains.ki == 0.0 and not bool(at_rest)
 
     def transfer(self, omega_rad_s: npt.ArrayLike) -> ComplexArray:
         """L(e^(j omega dt)), the loop cut at delta_lat, negative feedback: closed loop where 1 + L = 0.
 
         Args:
-            omega_rad_s: any shape, in [0, pi/dt]; 0 only when ki is 0.
+            omega_rad_s: any shape, in [0, pi/dt]; 0 only if `finite_at_zero`.
 
         Returns:
             The same shape.

@@ -39,7 +39,7 @@ def sample_derivatives(
         rng: source of randomness.
         spread_sigma: half width, in standard deviations.
         distribution: one of DISTRIBUTIONS.
-        correlation: (6, 6) correlation matrix in the order of DERIVATIVE_NAMES, before truncation; Gaussian only.
+        correlation: (6, 6) in the order of DERIVATIVE_NAMES, before truncation; Gaussian only.
 
     Returns:
         (n, 6), columns in the order of DERIVATIVE_NAMES.
@@ -68,8 +68,8 @@ def _truncated(
 ) -> npt.NDArray[np.float64]:
     """(n, 6) standard normal rows times root', drawn until n of them lie within +-spread in every column.
 
-    Whole rows are rejected, in order: exact for a correlated distribution, and for an uncorrelated one the same
-    as truncating each column, since the columns are independent.
+    Whole rows are rejected, in order: exact for a correlated distribution, and for an uncorrelated one the
+    same as truncating each column, since the columns are independent.
     """
     kept = np.empty((0, len(root)))
     while len(kept) < n:

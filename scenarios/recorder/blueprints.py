@@ -1,23 +1,26 @@
 """How a recording is laid out in the Rerun viewer: one page per manoeuvre, then everything, then 3D.
 
-The viewer knows no units, axis titles or reference lines: units stand in the names, limits are lines of their own.
+The viewer knows no units, axis titles or reference lines: units stand in the names, limits are lines of their
+own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scenarios.recorder.body import PLACE
 from scenarios.recorder.stream import TIMELINE, Colour
 
 BEFORE_S, AFTER_S = 1.0, 0.5
 """Time shown before and after a manoeuvre."""
 
-# Okabe and Ito's palette without black: eight hues that stay apart for colour-blind eyes, on dark and light ground.
+# Okabe and Ito's palette without black: eight hues that stay apart for colour-blind eyes, on dark and light
+# ground.
 PALETTE: tuple[Colour, ...] = (
     (86, 180, 233),
     (230, 159, 0),
@@ -28,6 +31,9 @@ PALETTE: tuple[Colour, ...] = (
     (0, 114, 178),
     (170, 170, 255),
 )
+RANKS: Mapping[str, float] = {"oscillates": 1.0, "failed": 1.5, "passed": 2.0, "best": 3.0}
+"""Line width of each rank of a candidate, from the least to the first; later ones are drawn on top."""
+
 SETPOINT: Colour = (235, 235, 235)
 LIMIT: Colour = (150, 150, 150)
 MEASURED: Colour = PALETTE[0]
@@ -41,9 +47,11 @@ class Page:
         name: the tab's title.
         start_s: left edge of its time axes on the recording's timeline, s.
         end_s: right edge, s.
-        roll_deg: lowest and highest roll angle to show, deg; this and the next two: None leaves it to the viewer.
+        roll_deg: lowest and highest roll angle to show, deg; here and below None leaves it to the viewer.
         rate_rad_s: the same for roll rates.
         error_deg: the same for errors.
+        delta_lat: the same for the roll torque.
+        delta_lat_room: the most that the motors can give, for the title.
         tracking: show errors instead of rates.
     """
 
@@ -53,16 +61,24 @@ class Page:
     roll_deg: tuple[float, float] | None = None
     rate_rad_s: tuple[float, float] | None = None
     error_deg: tuple[float, float] | None = None
+    delta_lat: tuple[float, float] | None = None
+    delta_lat_room: float | None = None
     tracking: bool = False
 
 
-def candidate_colour(index: int, passed: bool) -> Colour:
-    """Colour of candidate `index`: its hue, mixed half with grey unless it passed."""
-    hue = PALETTE[index % len(PALETTE)]
-    if passed:
-        return hue
-    red, green, blue = (round(0.5 * channel + 0.5 * 110) for channel in hue)
-    return red, green, blue
+def candidate_colour(index: int, rank: str) -> tuple[int, int, int, int]:
+    """Colour and opacity of candidate `index`.
+
+    Args:
+        index: its place in the run.
+        rank: one of `RANKS`; what failed is greyer, and what oscillates is see-through as well, since it
+            would paint the plots full.
+    """
+    grey, opacity = {"oscillates": (0.5, 150), "failed": (0.3, 255)}.get(rank, (0.0, 255))
+    red, green, blue = (
+        round((1.0 - grey) * channel + grey * 110) for channel in PALETTE[index % len(PALETTE)]
+    )
+    return red, green, blue, opacity
 
 
 def roll_range_deg(
@@ -90,7 +106,11 @@ def roll_range_deg(
 
 
 def _series(
-    name: str, entity: str | Sequence[str], page: Page | None = None, y: tuple[float, float] | None = None
+    name: str,
+    entity: str | Sequence[str],
+    page: Page | None = None,
+    y: tuple[float, float] | None = None,
+    legend: bool = True,
 ) -> Any:
     """A plot of one or several entities over the page's time."""
     import rerun.blueprint as rrb
@@ -101,7 +121,7 @@ def _series(
         contents=[entity] if isinstance(entity, str) else list(entity),
         axis_x=_time_axis(page),
         axis_y=None if y is None else rrb.ScalarAxis(range=y),
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
     )
 
 
@@ -162,15 +182,16 @@ def _blueprint(tabs: Sequence[Any], first: Page | None) -> Any:
     )
 
 
-def flight_blueprint(pages: Sequence[Page]) -> Any:
+def flight_blueprint(pages: Sequence[Page], whole: Page | None) -> Any:
     """Layout of one flight: a tab per manoeuvre, then the whole flight, then 3D.
 
     Args:
         pages: the manoeuvres flown, in order; may be empty.
+        whole: the whole flight; None while it is not known how long it is.
     """
     tabs = [_manoeuvre(page) for page in pages]
     first = pages[0] if pages else None
-    return _blueprint([*tabs, _whole_flight(), _space()], first)
+    return _blueprint([*tabs, _whole_flight(whole), _space(whole)], first)
 
 
 def _manoeuvre(page: Page) -> Any:
@@ -179,7 +200,12 @@ def _manoeuvre(page: Page) -> Any:
     plots = rrb.Vertical(
         _series("Roll angle [deg]", "/roll", page, page.roll_deg),
         _series("Roll rate p [rad/s]", "/roll_rate", page),
-        _series("Roll torque delta_lat [-]; grey: the most the motors can give", "/delta_lat", page),
+        _series(
+            f"Roll torque delta_lat [-]; the motors can give {page.delta_lat_room or 1.0:.2f}",
+            "/delta_lat",
+            page,
+            page.delta_lat,
+        ),
         _series("Motor commands [0..1]", "/motors", page, (-0.03, 1.03)),
         _lanes(page),
         row_shares=[4.0, 3.0, 2.5, 2.5, 2.0],
@@ -187,16 +213,16 @@ def _manoeuvre(page: Page) -> Any:
     return rrb.Horizontal(plots, _verdict_and_events(), column_shares=[2.4, 1.0], name=page.name)
 
 
-def _whole_flight() -> Any:
+def _whole_flight(page: Page | None) -> Any:
     import rerun.blueprint as rrb
 
     plots = rrb.Vertical(
-        _series("Roll angle [deg]", "/roll"),
-        _series("Pitch angle [deg]", "/pitch"),
-        _series("Body rates p, q, r [rad/s]", ("/roll_rate", "/pitch_rate", "/yaw_rate")),
-        _series("Motor commands [0..1]", "/motors", None, (-0.03, 1.03)),
-        _series("Position [m]", "/position"),
-        _lanes(),
+        _series("Roll angle [deg]", "/roll", page),
+        _series("Pitch angle [deg]", "/pitch", page),
+        _series("Body rates p, q, r [rad/s]", ("/roll_rate", "/pitch_rate", "/yaw_rate"), page),
+        _series("Motor commands [0..1]", "/motors", page, (-0.03, 1.03)),
+        _series("Position [m]", "/position", page),
+        _lanes(page),
         row_shares=[2.5, 2.0, 2.5, 2.0, 2.5, 2.0],
     )
     return rrb.Horizontal(plots, _verdict_and_events(), column_shares=[2.4, 1.0], name="Whole flight")
@@ -210,47 +236,50 @@ def _verdict_and_events() -> Any:
     )
 
 
-def _space() -> Any:
+def _space(page: Page | None) -> Any:
     import rerun.blueprint as rrb
 
     view = rrb.Spatial3DView(
-        name="East, north, up [m]; arrows: motor commands",
-        origin="/world",
+        name="East, north, up [m]; arrows: motor commands; squares on the ground: 1 m",
+        origin=PLACE,
+        contents="/world/**",
+        line_grid=False,
         eye_controls=rrb.EyeControls3D(
-            position=(-0.5, -0.9, 0.5),
-            look_target=(0.0, 0.0, 0.0),
-            eye_up=(0.0, 0.0, 1.0),
-            tracking_entity="/world/body",
+            position=(-0.35, -0.6, 0.3), look_target=(0.0, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)
         ),
     )
     plots = rrb.Vertical(
-        _series("Roll angle [deg]", "/roll"),
-        _series("Motor commands [0..1]", "/motors", None, (-0.03, 1.03)),
-        _lanes(),
+        _series("Roll angle [deg]", "/roll", page),
+        _series("Motor commands [0..1]", "/motors", page, (-0.03, 1.03)),
+        _lanes(page),
         row_shares=[3.0, 3.0, 1.5],
     )
     return rrb.Horizontal(view, plots, column_shares=[1.6, 1.0], name="3D")
 
 
 def compare_blueprint(pages: Sequence[tuple[str, Page]]) -> Any:
-    """Layout of a comparison: a tab per manoeuvre with every candidate above the table, then the circumstances.
+    """Layout of a comparison: a tab per manoeuvre, every candidate above the table; then the circumstances.
 
     Args:
         pages: (entity prefix, page) of each manoeuvre; the page's time counts from the manoeuvre's start.
     """
     import rerun.blueprint as rrb
 
+    def lower(name: str, quantity: str, prefix: str, page: Page, y: tuple[float, float] | None) -> Any:
+        # The colours are those of the plot above, whose legend is enough.
+        return _series(name, f"{prefix}/{quantity}/**", page, y, legend=False)
+
     tabs = [
         rrb.Vertical(
             _series(f"{page.name}: roll angle [deg]", f"{prefix}/roll/**", page, page.roll_deg),
             rrb.Horizontal(
-                _series("Roll error: set-point minus roll [deg]", f"{prefix}/error/**", page, page.error_deg)
+                lower("Roll error: set-point minus roll [deg]", "error", prefix, page, page.error_deg)
                 if page.tracking
-                else _series("Roll rate p [rad/s]", f"{prefix}/roll_rate/**", page, page.rate_rad_s),
-                _series("Roll torque delta_lat [-]", f"{prefix}/delta_lat/**", page),
+                else lower("Roll rate p [rad/s]", "roll_rate", prefix, page, page.rate_rad_s),
+                lower("Roll torque delta_lat [-]", "delta_lat", prefix, page, page.delta_lat),
             ),
             rrb.TextDocumentView(name="Verdicts", origin="/summary"),
-            row_shares=[3.2, 1.8, 2.2],
+            row_shares=[3.0, 1.7, 2.3],
             name=page.name,
         )
         for prefix, page in pages

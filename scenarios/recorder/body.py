@@ -16,6 +16,11 @@ from scenarios.recorder.stream import TIMELINE, Colour, Recording
 
 PATH_STRIDE = 25
 """Every so many rows a corner of the path."""
+PLACE = "/world/place"
+"""Where the vehicle is, without its attitude: seen from here it is in the middle, the horizon level."""
+BODY = PLACE + "/body"
+GROUND_M = 30
+"""Half the side of the drawn ground, squares of 1 m."""
 ARROW_DIAGONALS = 0.7
 """Length of a full-thrust arrow, in diagonals of the frame."""
 
@@ -53,15 +58,23 @@ class BodyView:
         grey = (150, 150, 150)
         stream = recording.stream
         stream.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        edge = float(GROUND_M)
+        across = [[(-edge, float(y), 0.0), (edge, float(y), 0.0)] for y in range(-GROUND_M, GROUND_M + 1)]
+        along = [[(x, y, z) for y, x, z in line] for line in across]
         stream.log(
-            "/world/body/arms",
+            "/world/ground",
+            rr.LineStrips3D([*across, *along], radii=-0.5, colors=[(70, 70, 70)]),
+            static=True,
+        )
+        stream.log(
+            f"{BODY}/arms",
             rr.LineStrips3D(
                 [[(0.0, 0.0, 0.0), tuple(hub)] for hub in hubs], radii=0.02 * diagonal, colors=[grey]
             ),
             static=True,
         )
         stream.log(
-            "/world/body/rotors",
+            f"{BODY}/rotors",
             rr.Cylinders3D(
                 lengths=[0.02 * diagonal] * len(hubs),
                 radii=[0.2 * diagonal] * len(hubs),
@@ -72,17 +85,16 @@ class BodyView:
             static=True,
         )
         stream.log(
-            "/world/body/front",
+            f"{BODY}/front",
             rr.Arrows3D(
                 vectors=[(0.45 * diagonal, 0.0, 0.0)],
                 colors=[(235, 235, 235)],
                 radii=0.02 * diagonal,
-                labels=["front"],
             ),
             static=True,
         )
         stream.log(
-            "/world/body/thrust",
+            f"{BODY}/thrust",
             rr.Arrows3D.from_fields(origins=hubs, colors=list(colours), radii=0.015 * diagonal),
             static=True,
         )
@@ -107,22 +119,23 @@ class BodyView:
         stream = self._recording.stream
         index = [rr.TimeColumn(TIMELINE, duration=time_s)]
         quat = enu_quaternions(columns["phi_rad"], columns["theta_rad"], columns["psi_rad"])
+        stream.send_columns(PLACE, index, rr.Transform3D.columns(translation=enu_m))
         stream.send_columns(
-            "/world/body",
+            BODY,
             index,
-            rr.Transform3D.columns(translation=enu_m, quaternion=quat[:, (1, 2, 3, 0)]),
+            rr.Transform3D.columns(quaternion=quat[:, (1, 2, 3, 0)]),
         )
         arrows = np.zeros((*motors.shape, 3))
         arrows[:, :, 2] = np.nan_to_num(motors) * self._arrow_m
         stream.send_columns(
-            "/world/body/thrust",
+            f"{BODY}/thrust",
             index,
             rr.Arrows3D.columns(vectors=arrows.reshape(-1, 3)).partition([motors.shape[1]] * len(time_s)),
         )
         self._corners.extend(enu_m[::PATH_STRIDE])
         stream.set_time(TIMELINE, duration=float(time_s[0]))
         stream.log(
-            "/world/path", rr.LineStrips3D([np.array(self._corners)], colors=[(86, 180, 233)], radii=[0.004])
+            "/world/path", rr.LineStrips3D([np.array(self._corners)], colors=[(86, 180, 233)], radii=[-1.5])
         )
 
 

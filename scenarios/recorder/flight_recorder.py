@@ -56,8 +56,8 @@ PLOTS = (
     _pair("/roll", "roll", "deg", "phi_sp_rad", "phi_rad", DEG),
     _pair("/roll_rate", "p", "rad/s", "p_sp_rad_s", "p_rad_s"),
     _pair("/pitch", "pitch", "deg", "theta_sp_rad", "theta_rad", DEG),
-    _pair("/pitch_rate", "q", "rad/s", "q_sp_rad_s", "q_rad_s"),
-    _pair("/yaw_rate", "r", "rad/s", "r_sp_rad_s", "r_rad_s"),
+    Plot("/pitch_rate", {"q_rad_s": ("q [rad/s]", PALETTE[1])}),
+    Plot("/yaw_rate", {"r_rad_s": ("r [rad/s]", PALETTE[2])}),
     Plot(
         "/velocity",
         {
@@ -72,8 +72,9 @@ PLOTS = (
 class FlightRecorder:
     """Streams one flight into a `.rrd` file and, if asked, to viewers.
 
-    The file grows under `<name>.partial.rrd` and gets its own name in `close`. A flight that dies leaves the partial
-    file, which the viewer opens too, with all but the last chunk. As a context manager it abandons an unclosed file.
+    The file grows under `<name>.partial.rrd` and gets its own name in `close`. A flight that dies leaves the
+    partial file, which the viewer opens too, with all but the last chunk. As a context manager it abandons an
+    unclosed file.
 
     Args:
         path: the finished file, `*.rrd`.
@@ -82,7 +83,8 @@ class FlightRecorder:
         rotors: of the airframe, at least one, in motor order.
         application_id: the viewer keeps one layout per application id.
         live_port: also serve viewers: `rerun --connect rerun+http://127.0.0.1:<port>/proxy`.
-        rows_per_chunk: telemetry rows written together; fewer are more live and slower. None: 500, or 50 when live.
+        rows_per_chunk: telemetry rows written together; fewer are more live and slower. None: 500, or 50 when
+            live.
 
     Raises:
         FileError: the file cannot be created, or the disk is nearly full.
@@ -108,12 +110,12 @@ class FlightRecorder:
         self._waiting_rows = 0
         self._last_mode = _NOTHING_YET
         self._segments: list[Segment] = []
-        self._roll_deg: list[NDArray[np.float64]] = []
+        self._shown: list[NDArray[np.float64]] = []
         self._recording: Recording | None = Recording(
             path, application_id=application_id, recording_id=recording_id, name=name, live_port=live_port
         )
         # A first layout, for live viewers and for a file that is never closed.
-        self._recording.layout(blueprints.flight_blueprint(()))
+        self._recording.layout(blueprints.flight_blueprint((), None))
         self._style(self._recording)
         self._body = BodyView(self._recording, rotors, self._motor_colours)
 
@@ -136,8 +138,8 @@ class FlightRecorder:
         """Add telemetry rows.
 
         Args:
-            batch: columns of `scenarios.telemetry.COLUMNS`, of equal length, later than everything before; `segment`
-                is not used.
+            batch: columns of `scenarios.telemetry.COLUMNS`, of equal length, later than everything before;
+                `segment` is not used.
         """
         self._waiting.append(batch)
         self._waiting_rows += len(batch["t_s"])
@@ -149,7 +151,7 @@ class FlightRecorder:
         self.recording.text("/events", t_s, _LEVELS[min(max(severity, 0), 7)], text)
 
     def segment(self, segment: Segment) -> None:
-        """Mark a measured part of the flight in the manoeuvre's lane; may be called as soon as its end is known."""
+        """Mark a measured part of the flight; may be called as soon as its end is known."""
         self._segments.append(segment)
 
     def close(self, summary: str = "", properties: Mapping[str, Mapping[str, Any]] | None = None) -> Path:
@@ -171,7 +173,7 @@ class FlightRecorder:
         if summary:
             recording.document("/summary", summary)
         recording.properties(properties or {})
-        recording.layout(blueprints.flight_blueprint(self._pages()))
+        recording.layout(blueprints.flight_blueprint(*self._pages()))
         self._recording = None
         return recording.finish()
 
@@ -221,30 +223,46 @@ class FlightRecorder:
         for row in np.flatnonzero(modes != before):
             recording.lane("/state/mode", float(time[row]), mode_name(int(modes[row])))
         self._last_mode = int(modes[-1])
-        self._roll_deg.append(
-            np.column_stack([time, rows["phi_sp_rad"] * DEG, rows["phi_rad"] * DEG]).astype(np.float64)
+        self._shown.append(
+            np.column_stack(
+                [time, rows["phi_sp_rad"] * DEG, rows["phi_rad"] * DEG, np.abs(rows["delta_lat"]), most]
+            ).astype(np.float64)
         )
 
     def _write_segments(self, recording: Recording) -> None:
-        """The lane ends where nothing is measured; a segment that begins where another ends takes its place."""
+        """A lane of what is measured: a segment that begins where another ends takes its place."""
         starts = {segment.start_s for segment in self._segments}
         for segment in self._segments:
             recording.lane("/state/manoeuvre", segment.start_s, segment.name)
             if segment.end_s not in starts:
                 recording.lane("/state/manoeuvre", segment.end_s, "")
 
-    def _pages(self) -> list[Page]:
-        if not self._roll_deg:
-            return []
-        time, phi_sp, phi = np.concatenate(self._roll_deg).T
+    def _pages(self) -> tuple[list[Page], Page | None]:
+        """A page for each manoeuvre, and one for the whole flight."""
+        if not self._shown:
+            return [], None
+        rows = np.concatenate(self._shown)
         pages = []
         for manoeuvre in dict.fromkeys(segment.manoeuvre for segment in self._segments):
             parts = [segment for segment in self._segments if segment.manoeuvre == manoeuvre]
             start, end = parts[0].start_s, parts[-1].end_s
-            shown = (time >= start) & (time <= end)
-            roll = blueprints.roll_range_deg(phi_sp[shown], phi[shown], spans=2.0)
-            pages.append(Page(manoeuvre, start - BEFORE_S, end + AFTER_S, roll))
-        return pages
+            within = rows[(rows[:, 0] >= start) & (rows[:, 0] <= end)]
+            if not len(within):
+                continue
+            peak, room = float(np.max(np.nan_to_num(within[:, 3]))), float(np.median(within[:, 4]))
+            pages.append(
+                Page(
+                    manoeuvre,
+                    start - BEFORE_S,
+                    end + AFTER_S,
+                    roll_deg=blueprints.roll_range_deg(within[:, 1], within[:, 2], spans=2.0),
+                    # A gentle set uses a fraction of what there is; its limits would leave a flat line to
+                    # look at.
+                    delta_lat=(-1.3 * peak, 1.3 * peak) if 0.0 < peak < 0.4 * room else None,
+                    delta_lat_room=room,
+                )
+            )
+        return pages, Page("Whole flight", float(rows[0, 0]), float(rows[-1, 0]))
 
 
 def mode_name(nav_state: int) -> str:
@@ -260,7 +278,7 @@ def mode_name(nav_state: int) -> str:
 
 
 def roll_extremes(rotors: Sequence[RotorPlace]) -> tuple[float, float]:
-    """Largest positive and largest negative entry (as a magnitude) of the roll column of PX4's normalised mix."""
+    """Largest positive and negative entry, as magnitudes, of the roll column of PX4's normalised mix."""
     from sitl.actuators import RotorEffect, normalised_mix
 
     effects = [RotorEffect((rotor.px_m, rotor.py_m, rotor.pz_m), km=rotor.km) for rotor in rotors]
@@ -273,9 +291,9 @@ def roll_room(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """How much delta_lat the motors can give at a collective thrust, the other axes quiet.
 
-    Motors stay within 0 to 1, and PX4 without airmode may lower the collective thrust for roll but not raise it
-    (sequential desaturation). With a and b the mix's extremes, delta_lat <= min(thrust / b, 1 / (a + b)), and the
-    other way round with a and b exchanged.
+    Motors stay within 0 to 1, and PX4 without airmode may lower the collective thrust for roll but not raise
+    it (sequential desaturation). With a and b the mix's extremes, delta_lat <= min(thrust / b, 1 / (a + b)),
+    and the other way round with a and b exchanged.
 
     Args:
         thrust: (n,) collective thrust set-point, 0 to 1.

@@ -1,7 +1,8 @@
 """A picture of a recording without a display: the viewer runs headless for a few seconds.
 
-It needs a Vulkan driver; on a machine without a graphics card Mesa's software one does (Debian: `mesa-vulkan-drivers`).
-Not while something is flown in real time on the same machine: the software renderer takes every core.
+It needs a Vulkan driver; on a machine without a graphics card Mesa's software one does (Debian:
+`mesa-vulkan-drivers`). Not while something is flown in real time on the same machine: the software renderer
+takes every core.
 """
 
 from __future__ import annotations
@@ -59,8 +60,8 @@ def screenshot(rrd: Path, png: Path, at_s: float | None = None, tab: str | None 
             ]
     except (RuntimeError, OSError, ValueError) as error:
         raise UsageError(
-            f"the Rerun viewer could not draw {rrd}: {error}. Without a graphics card it needs a software Vulkan driver "
-            "(Debian, Ubuntu: apt-get install mesa-vulkan-drivers libvulkan1)"
+            f"the Rerun viewer could not draw {rrd}: {error}. Without a graphics card it needs a software "
+            "Vulkan driver (Debian, Ubuntu: apt-get install mesa-vulkan-drivers libvulkan1)"
         ) from error
     part = png.with_name(png.name + ".part")
     try:

@@ -1,8 +1,8 @@
 """One Rerun file being written: opening, lines, lanes, texts, and the move to its final name.
 
-The file is the record of truth, so a viewer is never allowed to hold it up: a live view is served by ourselves on the
-loopback interface (`GrpcServerSink`). Pushing into a viewer (`GrpcSink`) beside a file stalls the file as soon as that
-viewer is slow or gone.
+The file is the record of truth, so a viewer is never allowed to hold it up: a live view is served by
+ourselves on the loopback interface (`GrpcServerSink`). Pushing into a viewer (`GrpcSink`) beside a file
+stalls the file as soon as that viewer is slow or gone.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from sitl.errors import FileError, UsageError
 
-Colour = tuple[int, int, int]
+Colour = tuple[int, ...]
+"""Red, green, blue and perhaps opacity, 0 to 255."""
 
 TIMELINE = "flight_time"
 """The viewer follows one timeline in all views, so flights and comparisons call theirs the same."""
@@ -80,7 +81,8 @@ class Recording:
     ) -> None:
         """Names, colours and widths of an entity's lines.
 
-        Peaks are kept: the viewer's default averages samples that share a pixel and draws saturated motors as 0.86.
+        Peaks are kept: the viewer's default averages samples that share a pixel and draws saturated motors as
+            0.86.
         """
         import rerun as rr
 
@@ -133,7 +135,7 @@ class Recording:
         self.stream.log(entity, rr.TextDocument(markdown, media_type="text/markdown"), static=True)
 
     def properties(self, groups: Mapping[str, Mapping[str, Any]]) -> None:
-        """Searchable facts about the recording: group -> name -> number or text; None and NaN are left out."""
+        """Searchable facts: group -> name -> number or text; None and NaN are left out."""
         import rerun as rr
 
         for group, values in groups.items():

@@ -1,0 +1,75 @@
+"""Telemetry logs (.tlog): every frame of both directions with the time it passed.
+
+Per frame eight bytes, big-endian: microseconds since 1 January 1970 UTC; then the frame as it was on the
+wire. No header. MAVProxy, QGroundControl and pymavlink write and read the same.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from sitl.errors import FileError
+
+# 1 January 2020 UTC. Simulated flights start here, on whatever day they are flown: same seed, same file.
+SIMULATED_EPOCH_US = 1_577_836_800_000_000
+
+_STAMP = struct.Struct(">Q")
+
+
+class TlogWriter:
+    """Writes a .tlog file; use it as a context manager, or close it.
+
+    Args:
+        path: the file, overwritten if it exists.
+        epoch_us: added to every time: SIMULATED_EPOCH_US where times are vehicle time, 0 where they are UTC.
+
+    Raises:
+        FileError: the file cannot be written (from `write` and `close` too, on a full disk).
+    """
+
+    def __init__(self, path: str | Path, *, epoch_us: int = SIMULATED_EPOCH_US) -> None:
+        self.path = Path(path)
+        self.epoch_us = epoch_us
+        self.frames = 0
+        try:
+            self._file = self.path.open("wb")
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def write(self, time_us: int, frame: bytes) -> None:
+        """Append one frame.
+
+        Args:
+            time_us: when it passed, in microseconds from the epoch; never negative.
+            frame: the whole frame.
+        """
+        try:
+            self._file.write(_STAMP.pack(self.epoch_us + time_us) + frame)
+        except OSError as error:
+            raise self._unwritable(error) from None
+        self.frames += 1
+
+    def close(self) -> None:
+        """Write what is buffered and release the file; may be repeated."""
+        try:
+            self._file.close()
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _unwritable(self, error: OSError) -> FileError:
+        return FileError(
+            self.path,
+            f"the telemetry log cannot be written ({error.strerror or error})",
+            "Check the folder, its permissions and the space left on the disk",
+        )

@@ -1,0 +1,287 @@
+"""The command line. Everything heavy is imported by the command that needs it: `froude --help` answers at once."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+if TYPE_CHECKING:
+    from scenarios.runner import Progress, RunResult
+    from scenarios.scenario import Scenario
+
+EXIT_OK, EXIT_GATE, EXIT_USAGE, EXIT_LINK, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
+
+_PROFILES = ("study", "sitl", "board")
+_SCALINGS = "derivatives,uncertainty,gain"
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        self.exit(EXIT_USAGE, f"{self.prog}: {message}\nTry '{self.prog} --help'.\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="froude",
+        description="Fly candidate autopilot gains on identified or Froude-scaled multirotors, over MAVLink.",
+        epilog="example: froude fly --vehicle ant-r:ant-x --gains table_7_2",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="store_true", help="print the version and stop")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
+
+    def add(name: str, run: Callable[[argparse.Namespace], int], text: str, example: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=text, description=text, epilog=f"example: {example}")
+        sub.set_defaults(run=run)
+        return sub
+
+    sub = add("airframes", _airframes, "List the airframes that come with the program.", "froude airframes")
+    sub.add_argument("--json", action="store_true", help="for machines")
+
+    sub = add("model", _model, "Show a vehicle's model: derivatives, modes, margins.", "froude model ant-r:ant-x")
+    sub.add_argument("spec", help="airframe, or reference:target; names or paths of .toml files")
+    _vehicle_options(sub)
+    sub.add_argument("--json", action="store_true", help="for machines")
+
+    sub = add(
+        "fly",
+        _fly,
+        "Upload gain sets, fly manoeuvres, say which sets pass.",
+        "froude fly --vehicle ant-x --gains table_7_2 table_2_2/ANT-X",
+    )
+    sub.add_argument("scenario", nargs="?", default="demo", help="name in the library or .toml file (default: demo)")
+    sub.add_argument("--vehicle", metavar="SPEC", help="airframe, or reference:target")
+    _vehicle_options(sub)
+    sub.add_argument("--gains", nargs="+", metavar="NAME|FILE", help="gain sets: table_7_2, table_2_2/ANT-X, x.params")
+    sub.add_argument("--connect", metavar="URL", help="fly this vehicle, such as udpin://127.0.0.1:14540")
+    sub.add_argument("--seed", type=int, metavar="N", help="of sensor noise")
+    sub.add_argument("--jobs", type=int, default=1, metavar="N", help="flights at a time (default: 1)")
+    sub.add_argument("--live", action="store_true", help="serve a Rerun viewer on 127.0.0.1 while flying")
+    sub.add_argument("--out", type=Path, default=Path("logs"), metavar="DIR", help="where run folders go (logs)")
+    sub.add_argument("--json", action="store_true", help="print run.json instead of the table")
+    sub.add_argument("--junit", type=Path, metavar="FILE", help="also write JUnit XML here")
+    sub.add_argument("--gate", action="store_true", help="exit status 1 unless every set passes")
+
+    sub = add("sitl", _sitl, "Serve a simulated vehicle to any ground station.", "froude sitl ant-x --speed 2")
+    sub.add_argument("spec", help="airframe, or reference:target")
+    _vehicle_options(sub)
+    sub.add_argument("--link", action="append", metavar="URL", help="instead of PX4's ports; may be repeated")
+    sub.add_argument("--speed", default="1", metavar="X|max", help="vehicle seconds per second (default: 1)")
+    sub.add_argument("--instance", type=int, default=0, metavar="N", help="PX4's port and system id offset")
+    sub.add_argument("--seed", type=int, default=0, metavar="N", help="of sensor noise")
+    return parser
+
+
+def _vehicle_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--scaling", metavar="WORDS", help=f"what Froude scaling applies to: {_SCALINGS}")
+    parser.add_argument("--profile", choices=_PROFILES, help="fidelity profile (default: sitl)")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: arguments without the program's name; the process's own if None.
+
+    Returns:
+        exit status: 0 done, 1 gate, 2 usage or a bad file, 3 link or vehicle, 130 interrupted.
+    """
+    from sitl.errors import FroudeError
+
+    parser = _parser()
+    args = parser.parse_args(argv)
+    args.argv = list(sys.argv[1:] if argv is None else argv)
+    if args.version:
+        from scenarios.runner import versions
+
+        print(f"froude {versions()['froude']}")
+        return EXIT_OK
+    if args.command is None:
+        parser.print_help()
+        return EXIT_USAGE
+    try:
+        status: int = args.run(args)
+        sys.stdout.flush()
+        return status
+    except FroudeError as error:
+        return _tell(str(error), error.exit_status)
+    except KeyboardInterrupt:
+        return _tell("interrupted", EXIT_INTERRUPTED)
+    except BrokenPipeError:
+        # the reader of our output went away (froude ... | head): nothing is wrong, and nothing can be told
+        sys.stderr.close()
+        return EXIT_OK
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return _tell(f"{where}{error.strerror or error}. Check the path, permissions and free space", EXIT_USAGE)
+
+
+def _tell(text: str, status: int) -> int:
+    print(f"froude: {text}", file=sys.stderr)
+    return status
+
+
+def _words(text: str | None, default: tuple[str, ...]) -> tuple[str, ...]:
+    return default if text is None else tuple(word.strip() for word in text.split(",") if word.strip())
+
+
+def _airframes(args: argparse.Namespace) -> int:
+    from sitl.airframe import list_airframes, load_airframe
+
+    frames = [load_airframe(name) for name in list_airframes()]
+    if args.json:
+        print(json.dumps([{**dataclasses.asdict(f), "path": str(f.path)} for f in frames], indent=2))
+        return EXIT_OK
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for title, justify in (("airframe", "left"), ("layout", "left"), ("rotors", "right"), ("mass kg", "right"),
+                           ("diagonal m", "right"), ("Ld rad/s^2", "right"), ("motor lag s*", "right")):  # fmt: skip
+        table.add_column(title, justify=justify)  # type: ignore[arg-type]
+    for f in frames:
+        table.add_row(f.name, f.layout, str(len(f.rotors)), f"{f.mass_kg:g}", f"{f.diagonal_m:g}",
+                      f"{f.derivatives.Ld:g}", f"{f.assumptions.motor_lag_s:g}")  # fmt: skip
+    Console().print(table)
+    print("* assumed, not measured. `froude model NAME` shows the rest; any path of a .toml works as a name.")
+    return EXIT_OK
+
+
+def _model(args: argparse.Namespace) -> int:
+    from scenarios.model_page import model_object, model_text
+    from sitl.profile import get_profile
+    from sitl.vehicle_spec import DEFAULT_SCALING, resolve_vehicle
+
+    model = resolve_vehicle(args.spec, _words(args.scaling, DEFAULT_SCALING))
+    shown = model_object(model, get_profile(args.profile or "sitl"))
+    print(json.dumps(shown, indent=2) if args.json else model_text(shown))
+    return EXIT_OK
+
+
+def _scenario(args: argparse.Namespace) -> Scenario:
+    from scenarios.scenario import load_scenario
+
+    scenario = load_scenario(args.scenario)
+    changes: dict[str, Any] = {}
+    if args.vehicle:
+        changes["vehicle"] = args.vehicle
+    if args.scaling is not None:
+        changes["scaling"] = _words(args.scaling, ())
+    if args.profile:
+        changes["profile"] = args.profile
+    if args.gains:
+        changes["gain_sets"] = tuple(args.gains)
+    if args.seed is not None:
+        changes["seed"] = args.seed
+    return dataclasses.replace(scenario, **changes)
+
+
+def _fly(args: argparse.Namespace) -> int:
+    from scenarios.runner import MEMORY, RunOptions, run_scenario
+
+    scenario = _scenario(args)
+    options = RunOptions(
+        out=args.out,
+        connect=args.connect or MEMORY,
+        jobs=args.jobs,
+        live_port=_live_port() if args.live else None,
+        command=("froude", *args.argv),
+    )
+    if options.live_port is not None:
+        print(f"live: rerun --connect rerun+http://127.0.0.1:{options.live_port}/proxy", file=sys.stderr)
+    with _progress_bar() as progress:
+        result = run_scenario(scenario, options, progress)
+    return _report(args, result)
+
+
+def _report(args: argparse.Namespace, result: RunResult) -> int:
+    from scenarios.limits import Outcome
+    from scenarios.run_folder import RunFolder, run_object
+    from scenarios.table import run_text, terminal_width
+
+    run, folder = result.run, result.folder
+    if folder is not None:
+        from scenarios.junit import write_junit
+
+        write_junit(run, folder / "junit.xml")
+    if args.junit is not None:
+        from scenarios.junit import write_junit
+
+        write_junit(run, args.junit)
+    if args.json:
+        shown = run_object(run, RunFolder(folder) if folder else None, ("froude", *args.argv))
+        print(json.dumps(shown, indent=2, ensure_ascii=False, allow_nan=False))
+    else:
+        width, colour = terminal_width(sys.stdout)
+        print(run_text(run, folder, width=width, colour=colour), end="")
+    if result.stopped is not None:
+        kept = f" What was flown is in {folder}." if folder is not None else ""
+        if isinstance(result.stopped, KeyboardInterrupt):
+            return _tell(f"interrupted.{kept}", EXIT_INTERRUPTED)
+        return _tell(f"{result.stopped}.{kept}", getattr(result.stopped, "exit_status", EXIT_LINK))
+    if args.gate and any(flight.outcome is not Outcome.PASS for flight in run.flights):
+        return EXIT_GATE
+    return EXIT_OK
+
+
+def _live_port() -> int:
+    import socket
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _progress_bar() -> AbstractContextManager[Callable[[Progress], object]]:
+    """A bar on a terminal, nothing elsewhere."""
+    if not sys.stderr.isatty():
+        return nullcontext(lambda _: None)
+    from scenarios.progress import progress_bar
+
+    return progress_bar()
+
+
+def _sitl(args: argparse.Namespace) -> int:
+    from bridge.clock import ScaledClock
+    from bridge.sitl_server import banner, close_links, default_urls, open_links, serve, stop_on_signals
+    from sitl.errors import UsageError
+    from sitl.profile import get_profile
+    from sitl.vehicle import Vehicle
+    from sitl.vehicle_spec import DEFAULT_SCALING, resolve_vehicle
+
+    clock = None
+    if args.speed != "max":
+        try:
+            clock = ScaledClock(float(args.speed))
+        except ValueError:
+            raise UsageError(f"--speed {args.speed}: give a number above 0, or 'max'") from None
+    model = resolve_vehicle(args.spec, _words(args.scaling, DEFAULT_SCALING))
+    vehicle = Vehicle(model, get_profile(args.profile or "sitl"), seed=args.seed)
+    links = open_links(args.link or default_urls(args.instance), instance=args.instance)
+    terminal = sys.stderr.isatty()
+    try:
+        print(banner(model.name, links), flush=True)
+        print("Ctrl-C stops it.", flush=True)
+        with stop_on_signals() as stop:
+            serve(
+                vehicle,
+                links,
+                clock,
+                stop=stop,
+                report=(lambda s: print(f"\r{s.line()}\x1b[K", end="", file=sys.stderr)) if terminal else None,
+            )
+    finally:
+        close_links(links)
+    if terminal:
+        print(file=sys.stderr)
+    return EXIT_OK
+
+
+if __name__ == "__main__":
+    sys.exit(main())

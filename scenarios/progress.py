@@ -1,0 +1,39 @@
+"""A progress bar for a run, on a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from scenarios.runner import Progress
+
+PHASES = ("connect", "upload", "take off", "land", "restore")
+
+
+@contextmanager
+def progress_bar() -> Iterator[Callable[[Progress], object]]:
+    """Yields the callback of `run_scenario`; the bar vanishes when the run is over."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    bar = Bar(
+        TextColumn("{task.description:<24}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[phase]}"),
+        TimeElapsedColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    )
+    with bar:
+        task = bar.add_task("getting ready", total=None, phase="the first time compiles the laws: half a minute")
+
+        def show(progress: Progress) -> None:
+            bar.update(
+                task, description=progress.name, completed=progress.index, total=progress.count, phase=progress.phase
+            )
+
+        yield show

@@ -1,0 +1,221 @@
+"""All candidates of a run over each other, every manoeuvre from its own start.
+
+The viewer cannot lay recordings over each other, so a run gets one more recording with everything in it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenarios.limits import LIMIT_CYCLE_RAD_S, Outcome
+from scenarios.recorder import blueprints
+from scenarios.recorder.blueprints import AFTER_S, BEFORE_S, LIMIT, RANKS, SETPOINT, Page, candidate_colour
+from scenarios.recorder.flight_recorder import DEG
+from scenarios.recorder.stream import Recording
+
+if TYPE_CHECKING:
+    from scenarios.flight import FlightRecord, RunRecord, Segment
+
+APPLICATION_ID = "froude-compare"
+"""The viewer keeps one layout per application id, so comparisons need their own."""
+
+BAND = 0.05
+"""Half width of the settling band that is drawn, of the step's amplitude."""
+
+
+def record_compare(run: RunRecord, path: Path, *, live_port: int | None = None) -> Path:
+    """Write the comparison of a run.
+
+    Args:
+        run: flights with telemetry and segments; a flight that never reached a manoeuvre is only in the
+            table.
+        path: `compare.rrd`.
+        live_port: as for `FlightRecorder`.
+
+    Returns:
+        The finished file.
+
+    Raises:
+        FileError: it cannot be written.
+        UsageError: the port is taken.
+    """
+    from scenarios import markdown
+
+    recording = Recording(
+        path,
+        application_id=APPLICATION_ID,
+        recording_id=f"{run.scenario.name}-{run.started_utc}-compare",
+        name=f"{run.scenario.name}: {run.vehicle.get('name', run.scenario.vehicle)}",
+        live_port=live_port,
+    )
+    manoeuvres = dict.fromkeys(segment.manoeuvre for flight in run.flights for segment in flight.segments)
+    pages = []
+    for number, manoeuvre in enumerate(manoeuvres, start=1):
+        parts = _parts(run.flights, manoeuvre)
+        if parts:
+            prefix = f"/{number}_" + re.sub(r"[^A-Za-z0-9_-]+", "_", manoeuvre)
+            pages.append((prefix, _write_manoeuvre(recording, prefix, manoeuvre, parts)))
+    recording.document("/summary", markdown.verdicts(run))
+    recording.document("/circumstances", markdown.circumstances(run))
+    for flight in run.flights:
+        recording.properties(flight_properties(flight, prefix=f"{flight.gain_set.slug}_"))
+    recording.layout(blueprints.compare_blueprint(pages))
+    return recording.finish()
+
+
+def flight_properties(flight: FlightRecord, prefix: str = "") -> dict[str, dict[str, Any]]:
+    """Gains, metrics and verdict of a flight as properties of a recording."""
+    return {
+        f"{prefix}gains": dict(flight.parameters or flight.gain_set.parameters),
+        f"{prefix}metrics": {metric.name: metric.value for metric in flight.metrics if not metric.segment},
+        f"{prefix}verdict": {
+            "outcome": str(flight.outcome),
+            "reason": flight.reason,
+            "vehicle": flight.vehicle_spec,
+            "seed": flight.seed,
+            "telemetry_sha256": flight.telemetry_sha256,
+        },
+    }
+
+
+def best_flight(flights: Sequence[FlightRecord]) -> FlightRecord | None:
+    """Of those that pass, the closest to its set-point: least RMS error, without tracking shortest rise."""
+    passed = [flight for flight in flights if flight.outcome is Outcome.PASS]
+
+    def rank(flight: FlightRecord) -> tuple[float, float]:
+        values = [flight.metric(name) for name in ("rms_error_deg", "rise_time_s")]
+        error, rise = (
+            np.inf if metric is None or metric.value is None else metric.value for metric in values
+        )
+        return error, rise
+
+    return min(passed, key=rank) if passed else None
+
+
+def _ranks(flights: Sequence[FlightRecord]) -> list[str]:
+    best = best_flight(flights)
+
+    def rank(flight: FlightRecord) -> str:
+        if flight is best:
+            return "best"
+        if flight.outcome is Outcome.FAIL:
+            return "oscillates" if _oscillates(flight) else "failed"
+        return "failed" if flight.outcome is Outcome.UNSET else "passed"
+
+    return [rank(flight) for flight in flights]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One flight's rows of one manoeuvre, time counted from its start."""
+
+    flight: FlightRecord
+    number: int
+    rank: str
+    segments: tuple[Segment, ...]
+    time: NDArray[np.float64]
+    phi_sp_deg: NDArray[np.float64]
+    phi_deg: NDArray[np.float64]
+    p_rad_s: NDArray[np.float64]
+    delta_lat: NDArray[np.float64]
+
+    @property
+    def duration_s(self) -> float:
+        return self.segments[-1].end_s - self.segments[0].start_s
+
+    @property
+    def error_deg(self) -> NDArray[np.float64]:
+        return self.phi_sp_deg - self.phi_deg
+
+
+def _parts(flights: Sequence[FlightRecord], manoeuvre: str) -> list[_Part]:
+    """Of every flight that came to the manoeuvre, the last to be drawn on top last."""
+    parts = []
+    for number, (flight, rank) in enumerate(zip(flights, _ranks(flights), strict=True)):
+        segments = tuple(segment for segment in flight.segments if segment.manoeuvre == manoeuvre)
+        if not segments:
+            continue
+        start = segments[0].start_s
+        rows = flight.telemetry.between(start - BEFORE_S, segments[-1].end_s + AFTER_S)
+        if not len(rows):
+            continue
+        names = ("phi_sp_rad", "phi_rad", "p_rad_s", "delta_lat")
+        phi_sp, phi, p, delta_lat = (rows[name].astype(np.float64) for name in names)
+        parts.append(
+            _Part(flight, number, rank, segments, rows["t_s"] - start, phi_sp * DEG, phi * DEG, p, delta_lat)
+        )
+    order = list(RANKS)
+    return sorted(parts, key=lambda part: (order.index(part.rank), part.number))
+
+
+def _write_manoeuvre(recording: Recording, prefix: str, manoeuvre: str, parts: Sequence[_Part]) -> Page:
+    """Every flight's part of one manoeuvre; returns its page."""
+    # A flight that was broken off shows only the beginning of the set-point.
+    longest = max(parts, key=lambda part: part.duration_s)
+    tracking = all(segment.kind == "track" for segment in longest.segments)
+    _write_setpoint(recording, prefix, longest)
+    for place, part in enumerate(parts, start=1):
+        best = ", best" if part.rank == "best" else ""
+        name = f"{part.flight.gain_set.name}: {part.flight.outcome}{best}"
+        for quantity, unit, values in (
+            ("roll", "deg", part.phi_deg),
+            ("error", "deg", part.error_deg),
+            ("roll_rate", "rad/s", part.p_rad_s),
+            ("delta_lat", "-", part.delta_lat),
+        ):
+            entity = f"{prefix}/{quantity}/{place:02d}_{part.flight.gain_set.slug}"
+            colour = candidate_colour(part.number, part.rank)
+            recording.style(entity, [f"{name} [{unit}]"], [colour], widths=[RANKS[part.rank]])
+            recording.lines(entity, part.time, values)
+    quiet = [part for part in parts if not _oscillates(part.flight)]
+    return Page(
+        manoeuvre,
+        -BEFORE_S,
+        longest.duration_s + AFTER_S,
+        roll_deg=blueprints.roll_range_deg(
+            longest.phi_sp_deg, np.concatenate([part.phi_deg for part in parts]), spans=0.5
+        ),
+        rate_rad_s=_range([part.p_rad_s for part in quiet]),
+        error_deg=_range([part.error_deg for part in quiet]),
+        delta_lat=_range([part.delta_lat for part in quiet]),
+        tracking=tracking,
+    )
+
+
+def _write_setpoint(recording: Recording, prefix: str, part: _Part) -> None:
+    """The set-point, and the band around the target of each scored step."""
+    entity = f"{prefix}/roll/00_setpoint"
+    recording.style(entity, ["set-point [deg]"], [SETPOINT], widths=[2.0], step=True)
+    recording.lines(entity, part.time, part.phi_sp_deg)
+    begin = part.segments[0].start_s
+    for number, segment in enumerate(segment for segment in part.segments if segment.kind == "step"):
+        entity = f"{prefix}/roll/00_band_{number}"
+        names = [f"+{100 * BAND:g} % of the step [deg]", f"-{100 * BAND:g} % [deg]"]
+        half = BAND * abs(segment.amplitude_rad)
+        edges = np.array([segment.phi_to_rad + half, segment.phi_to_rad - half]) * DEG
+        recording.style(entity, names, [LIMIT, LIMIT], widths=[1.0, 1.0])
+        times = np.array([segment.start_s, segment.end_s]) - begin
+        recording.lines(entity, times, np.array([edges, edges]))
+
+
+def _oscillates(flight: FlightRecord) -> bool:
+    metric = flight.metric("oscillation_rad_s")
+    return metric is None or metric.value is None or metric.value > LIMIT_CYCLE_RAD_S
+
+
+def _range(parts: Sequence[NDArray[np.float64]]) -> tuple[float, float] | None:
+    """Axis for the flights that do not oscillate; the others would make them a flat line."""
+    values = np.concatenate([np.zeros(0), *parts])
+    values = values[np.isfinite(values)]
+    if not values.size:
+        return None
+    low, high = float(values.min()), float(values.max())
+    margin = 0.3 * (high - low)
+    return (low - margin, high + margin) if margin > 0.0 else None

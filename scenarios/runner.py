@@ -1,0 +1,235 @@
+"""All flights of one command: gain sets checked, flown one after the other or side by side, written as one run."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from multiprocessing import get_context
+from pathlib import Path
+
+from bridge.clock import utc_stamp
+from scenarios.flight import FlightRecord, RunRecord
+from scenarios.gain_set import GainSet, check, load_all
+from scenarios.one_flight import MEMORY, FlightJob, FlightStoppedError, fly
+from scenarios.run_folder import RunFolder, vehicle_description
+from scenarios.scenario import Scenario
+from sitl.airframe import FlightGains
+from sitl.errors import UsageError
+from sitl.parameters import ParameterTable, ParameterType
+from sitl.profile import Profile
+from sitl.vehicle import airframe_parameters
+from sitl.vehicle_spec import VehicleModel
+
+LIBRARIES = ("numpy", "scipy", "numba", "control", "pymavlink", "pyarrow", "rerun-sdk")
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a run is made, beside the scenario.
+
+    Attributes:
+        out: folder that run folders are made in; None keeps nothing.
+        connect: link URL of the vehicle, memory:// for our own.
+        jobs: flights at a time; more than one only for vehicles of our own.
+        live_port: port that serves viewers while flying; None for none.
+        command: as typed, for run.json.
+    """
+
+    out: Path | None = Path("logs")
+    connect: str = MEMORY
+    jobs: int = 1
+    live_port: int | None = None
+    command: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run is: flight `index` of `count`, in `phase`."""
+
+    index: int
+    count: int
+    name: str
+    phase: str
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """A finished run: its record, its folder (None if nothing was kept), and what stopped it early, if anything."""
+
+    run: RunRecord
+    folder: Path | None
+    stopped: BaseException | None = None
+
+
+def run_scenario(
+    scenario: Scenario, options: RunOptions, progress: Callable[[Progress], object] = lambda _: None
+) -> RunResult:
+    """Fly every gain set of a scenario.
+
+    Args:
+        scenario: with its gain sets. options: how. progress: called at every phase of every flight.
+
+    Returns:
+        the run; flights that were flown are in it even if something stopped it.
+
+    Raises:
+        UsageError, FileError: before anything is flown: a bad file, name or number.
+    """
+    model = scenario.resolve_vehicle()
+    profile = scenario.resolve_profile()
+    gain_sets = load_all(scenario.gain_sets)
+    if not gain_sets:
+        raise UsageError('no gain sets to fly: give --gains, for example "--gains table_7_2"')
+    if options.jobs < 1:
+        raise UsageError(f"--jobs {options.jobs}: give 1 or more")
+    if options.jobs > 1 and options.connect != MEMORY:
+        raise UsageError("--jobs above 1 needs vehicles of our own; leave out --connect or fly one at a time")
+    candidates = [plan(gain_set, scenario, model, profile) for gain_set in gain_sets]
+    baseline = _baseline(gain_sets, scenario, model, profile)
+    folder = None
+    if options.out is not None:
+        folder = RunFolder.create(options.out, utc_stamp(), scenario.name, model.name)
+    jobs = [
+        replace(
+            job,
+            folder=folder.path / "flights" if folder else None,
+            connect=options.connect,
+            live_port=options.live_port,
+        )
+        for job in (*candidates, *([baseline] if baseline else []))
+    ]
+    flown, stopped = _fly_all(jobs, options.jobs, progress)
+    own = flown.get(len(candidates)) if baseline else None
+    run = RunRecord(
+        scenario=scenario,
+        vehicle=vehicle_description(model),
+        profile=tuple(profile.describe()),
+        flights=tuple(flown[i] for i in sorted(flown) if i < len(candidates)),
+        baseline=own,
+        started_utc=utc_stamp(),
+        versions=versions(),
+        complete=stopped is None,
+    )
+    if folder is not None:
+        progress(Progress(len(jobs), len(jobs), "run", "write"))
+        folder.write_run_json(run, options.command)
+        from scenarios.recorder.comparison import record_compare
+
+        record_compare(run, folder.compare)
+        folder.write_run_json(run, options.command)
+    return RunResult(run, folder.path if folder else None, stopped)
+
+
+def plan(gain_set: GainSet, scenario: Scenario, model: VehicleModel, profile: Profile) -> FlightJob:
+    """The parameters that flying a set means, checked against the vehicle's table.
+
+    Roll flies the set. Pitch flies the set mirrored (axes "both"), or what the set itself says of pitch, or the
+    airframe's own flight gains.
+
+    Raises:
+        FileError: unknown parameter, NaN, negative or absurd gain.
+    """
+    table = ParameterTable(airframe_parameters(model, profile))
+    warnings = check(gain_set, table)
+    values: dict[str, float | int] = {}
+    if scenario.axes == "both":
+        values.update(gain_set.mirrored().parameters)
+    elif not any(name.startswith("MC_PITCH") for name in gain_set.parameters):
+        own = model.airframe.flight_gains
+        if own is not None:
+            values.update(_gains("PITCH", own))
+        else:
+            warnings.append(f"{model.airframe.name} has no flight gains of its own: pitch flies PX4's defaults")
+    values.update(gain_set.parameters)
+    typed: dict[str, tuple[float | int, ParameterType]] = {
+        name: (value, table.spec(name).type) for name, value in values.items()
+    }
+    return FlightJob(gain_set, typed, scenario, model, profile, tuple(warnings))
+
+
+def _gains(axis: str, gains: FlightGains) -> dict[str, float | int]:
+    return {
+        f"MC_{axis}_P": gains.k_phi,
+        f"MC_{axis}RATE_K": 1.0,
+        f"MC_{axis}RATE_P": gains.kp,
+        f"MC_{axis}RATE_I": gains.ki,
+        f"MC_{axis}RATE_D": gains.kd,
+        f"MC_{axis}RATE_FF": 0.0,
+    }
+
+
+def _baseline(
+    gain_sets: Sequence[GainSet], scenario: Scenario, model: VehicleModel, profile: Profile
+) -> FlightJob | None:
+    """The airframe's own flight gains, unless they are among the candidates or not known."""
+    own = model.airframe.flight_gains
+    if own is None:
+        return None
+    wanted = _gains("ROLL", own)
+    defaults = ParameterTable()
+
+    def flies_own(gain_set: GainSet) -> bool:
+        return all(gain_set.parameters.get(name, defaults.get(name)) == value for name, value in wanted.items())
+
+    if any(flies_own(gain_set) for gain_set in gain_sets):
+        return None
+    gain_set = GainSet(
+        name=f"own {model.airframe.name}", parameters=wanted, source="the airframe's own flight gains", note="baseline"
+    )
+    return plan(gain_set, scenario, model, profile)
+
+
+def _fly_all(
+    jobs: Sequence[FlightJob], workers: int, progress: Callable[[Progress], object]
+) -> tuple[dict[int, FlightRecord], BaseException | None]:
+    flown: dict[int, FlightRecord] = {}
+    if workers == 1 or len(jobs) == 1:
+        for index, job in enumerate(jobs):
+            name = job.gain_set.name
+            try:
+                flown[index] = fly(
+                    job, lambda phase, i=index, n=name: progress(Progress(i, len(jobs), n, phase))  # type: ignore[misc]
+                )
+            except FlightStoppedError as stop:
+                flown[index] = stop.record
+                return flown, stop.cause
+        return flown, None
+    try:
+        for index, record in _pool(jobs, workers):
+            flown[index] = record
+            progress(Progress(len(flown) - 1, len(jobs), record.gain_set.name, "done"))
+    except FlightStoppedError as stop:
+        return flown, stop.cause
+    except KeyboardInterrupt as stop_:
+        return flown, stop_
+    return flown, None
+
+
+def _pool(jobs: Sequence[FlightJob], workers: int) -> Iterator[tuple[int, FlightRecord]]:
+    # spawn: a forked child of a process that has started Arrow's or Rerun's threads may hang
+    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn")) as pool:
+        waiting = {pool.submit(fly, job): index for index, job in enumerate(jobs)}
+        for done in as_completed(waiting):
+            yield waiting[done], done.result()
+
+
+def versions() -> dict[str, str]:
+    """This program's version, Python's and the libraries'."""
+    found = {"froude": _version("froude"), "python": platform.python_version()}
+    return found | {name: _version(name) for name in LIBRARIES}
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def default_jobs() -> int:
+    """Flights at a time when nobody asks: one, so that a run is as quick as it is quiet."""
+    return max(1, int(os.environ.get("FROUDE_JOBS", "1")))

@@ -1,0 +1,136 @@
+"""From a vehicle's messages to telemetry: one row per ATTITUDE, the other messages held until their next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bridge.client import Client
+from bridge.connection import Message
+from scenarios.flight import Segment
+from scenarios.telemetry import NO_SEGMENT, Telemetry
+
+Columns = dict[str, npt.NDArray[Any]]
+
+ATTITUDE = 30
+LOCAL_POSITION_NED = 32
+ATTITUDE_TARGET = 83
+HIL_ACTUATOR_CONTROLS = 93
+CURRENT_MODE = 436
+
+ROWS_PER_BATCH = 500
+_MOTORS_SHOWN = 8
+_MOTORS_SENT = 16
+_NAN3 = (float("nan"),) * 3
+_NAN8 = (float("nan"),) * 8
+_NAN16 = (float("nan"),) * _MOTORS_SENT
+
+
+class Sampler:
+    """Collects rows while a client pumps.
+
+    A row is finished when the next ATTITUDE comes, so that everything the vehicle sends in the same tick is in it.
+
+    Args:
+        client: whose messages.
+        inverse: (2, n) delta_lat and delta_lon per unit of motor command: the pseudo-inverse of the airframe's
+            normalised mix.
+        on_batch: called with every few hundred finished rows, in order.
+    """
+
+    def __init__(
+        self, client: Client, inverse: npt.NDArray[np.float64], on_batch: Callable[[Columns], object] | None = None
+    ) -> None:
+        self._state = client.state
+        self._inverse = inverse
+        self._on_batch = on_batch
+        self._attitude: tuple[float, ...] | None = None
+        self._target: tuple[float, ...] = _NAN8
+        self._position: tuple[float, ...] = _NAN3 + _NAN3
+        self._motors: Sequence[float] = _NAN16
+        self._rows: list[tuple[float, ...]] = []
+        self._batches: list[Columns] = []
+        self.last_s = -1.0
+        client.subscribe("ATTITUDE", self._on_attitude)
+        client.subscribe("ATTITUDE_TARGET", self._on_target)
+        client.subscribe("LOCAL_POSITION_NED", self._on_position)
+        client.subscribe("HIL_ACTUATOR_CONTROLS", self._on_motors)
+
+    def _on_attitude(self, m: Message) -> None:
+        self._finish_row()
+        t_s = m.time_boot_ms * 1e-3
+        if t_s <= self.last_s:
+            return
+        self.last_s = t_s
+        self._attitude = (t_s, m.roll, m.pitch, m.yaw, m.rollspeed, m.pitchspeed, m.yawspeed)
+
+    def _on_target(self, m: Message) -> None:
+        self._target = (*m.q, m.body_roll_rate, m.body_pitch_rate, m.body_yaw_rate, m.thrust)
+
+    def _on_position(self, m: Message) -> None:
+        self._position = (m.x, m.y, m.z, m.vx, m.vy, m.vz)
+
+    def _on_motors(self, m: Message) -> None:
+        self._motors = m.controls
+
+    def _finish_row(self) -> None:
+        if self._attitude is None:
+            return
+        state = self._state
+        self._rows.append(
+            (*self._attitude, *self._target, *self._position, *self._motors, state.nav_state, state.armed)
+        )
+        self._attitude = None
+        if len(self._rows) >= ROWS_PER_BATCH:
+            self.flush()
+
+    def flush(self) -> None:
+        """Hand over the finished rows."""
+        if not self._rows:
+            return
+        columns = self._columns(np.array(self._rows, dtype=np.float64))
+        self._rows = []
+        self._batches.append(columns)
+        if self._on_batch is not None:
+            self._on_batch(columns)
+
+    def _columns(self, rows: npt.NDArray[np.float64]) -> Columns:
+        names = ("t_s", "phi_rad", "theta_rad", "psi_rad", "p_rad_s", "q_rad_s", "r_rad_s")
+        columns: Columns = {name: rows[:, i] for i, name in enumerate(names)}
+        w, x, y, z = rows[:, 7:11].T
+        columns["phi_sp_rad"] = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+        columns["theta_sp_rad"] = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+        columns["psi_sp_rad"] = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        for i, name in enumerate(("p_sp_rad_s", "q_sp_rad_s", "r_sp_rad_s", "thrust_sp")):
+            columns[name] = rows[:, 11 + i]
+        for i, name in enumerate(("north_m", "east_m", "down_m", "v_north_m_s", "v_east_m_s", "v_down_m_s")):
+            columns[name] = rows[:, 15 + i]
+        motors = rows[:, 21 : 21 + _MOTORS_SENT]
+        count = self._inverse.shape[1]
+        for i in range(_MOTORS_SHOWN):
+            columns[f"motor{i + 1}"] = motors[:, i] if i < count else np.full(len(rows), np.nan)
+        delta = motors[:, :count] @ self._inverse.T
+        columns["delta_lat"], columns["delta_lon"] = delta[:, 0], delta[:, 1]
+        columns["nav_state"] = rows[:, 21 + _MOTORS_SENT].astype(np.int16)
+        columns["armed"] = rows[:, 22 + _MOTORS_SENT].astype(np.bool_)
+        return columns
+
+    def telemetry(self, segments: Sequence[Segment]) -> Telemetry:
+        """Everything so far, with the column `segment` filled in.
+
+        Args:
+            segments: of the flight, in order; a row belongs to the one with start_s <= t_s < end_s.
+        """
+        self._finish_row()
+        self.flush()
+        if not self._batches:
+            return Telemetry.empty()
+        columns = {name: np.concatenate([batch[name] for batch in self._batches]) for name in self._batches[0]}
+        t_s = columns["t_s"]
+        segment = np.full(len(t_s), NO_SEGMENT, dtype=np.int16)
+        for index, part in enumerate(segments):
+            segment[(t_s >= part.start_s - 1e-9) & (t_s < part.end_s - 1e-9)] = index
+        return Telemetry.from_columns({**columns, "segment": segment})

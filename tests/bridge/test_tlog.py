@@ -1,0 +1,67 @@
+"""A log of ours is a log to pymavlink, and so to MAVProxy and QGroundControl."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from bridge.connection import Connection
+from bridge.tlog import SIMULATED_EPOCH_US, TlogWriter
+from sitl.errors import FileError
+
+
+def test_pymavlink_reads_it_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MAVLINK20", "1")
+    monkeypatch.setenv("MAVLINK_DIALECT", "common")
+    from pymavlink import mavutil
+
+    vehicle, ground = Connection(1, 1), Connection(255, 190)
+    path = tmp_path / "flight.tlog"
+    written = []
+    with TlogWriter(path) as log:
+        for tick in range(200):
+            time_us = tick * 4000
+            sender = vehicle if tick % 3 else ground
+            log.write(time_us, sender.encode("ATTITUDE", time_boot_ms=tick * 4, roll=0.01 * tick))
+            written.append((time_us, sender.sysid, tick * 4))
+    assert log.frames == 200
+
+    reader = mavutil.mavlink_connection(str(path), dialect="common")
+    read = []
+    while (message := reader.recv_match(type="ATTITUDE")) is not None:
+        since_us = round(message._timestamp * 1e6) - SIMULATED_EPOCH_US
+        read.append((since_us, message.get_srcSystem(), message.time_boot_ms))
+    reader.close()
+    assert read == written
+
+
+def test_the_bytes_are_the_stamp_and_the_frame(tmp_path: Path) -> None:
+    path = tmp_path / "a.tlog"
+    with TlogWriter(path, epoch_us=0) as log:
+        log.write(0x0102030405060708, b"\xfdframe")
+    assert path.read_bytes() == bytes(range(1, 9)) + b"\xfdframe"
+
+
+def test_simulated_flights_make_the_same_file_on_any_day(tmp_path: Path) -> None:
+    for name in ("monday", "tuesday"):
+        with TlogWriter(tmp_path / name) as log:
+            log.write(4000, Connection(1, 1).encode("HEARTBEAT"))
+    assert (tmp_path / "monday").read_bytes() == (tmp_path / "tuesday").read_bytes()
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "nowhere" / "a.tlog"
+    with pytest.raises(FileError, match=r"a\.tlog: the telemetry log cannot be written \(No such file"):
+        TlogWriter(path)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")  # noqa: PTH110
+def test_a_full_disk_is_one_clear_line() -> None:
+    log = TlogWriter("/dev/full")
+    with pytest.raises(FileError, match=r"No space left on device.*space left on the disk"):
+        log.write(0, bytes(1_000_000))
+    with pytest.raises(FileError):
+        log.close()
+    log.close()
