@@ -225,11 +225,11 @@ class Client:
         self._acks.append((m.command, m.result))
 
     def _on_text(self, m: Message) -> None:
-        text = m.text
-        if m.id:
-            text = self._chunks.pop(m.id, "") + text
+        text, number = m.text, m["id"]
+        if number:
+            text = self._chunks.pop(number, "") + text
             if len(m.text) == _TEXT_CHUNK:
-                self._chunks[m.id] = text
+                self._chunks[number] = text
                 return
         text = text.rstrip("\t")
         self.state.texts.append((self.now_us(), m.severity, text))

@@ -114,9 +114,7 @@ class ScaledClock:
 
     def __init__(self, speed: float, wall: Clock | None = None) -> None:
         if not (math.isfinite(speed) and speed > 0):
-            raise UsageError(
-                f"--speed {speed}: give a number above 0, or 'max' for as fast as the machine can"
-            )
+            raise UsageError(f"--speed {speed}: give a number above 0, or 'max' for as fast as the machine can")
         self.speed = speed
         self._wall: Clock = wall or WallClock()
         self._start_us = self._wall.now_us()

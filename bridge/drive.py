@@ -78,7 +78,10 @@ class NetworkDrive(Drive):
     def heard(self, time_us: int) -> None:
         """A message carried this vehicle time; a jump back means that the vehicle started anew."""
         if time_us < self._now_us - 1_000_000:
-            raise PeerLost("the vehicle", f"its clock went back from {self._now_us / 1e6:.1f} s to {time_us / 1e6:.1f} s: it restarted")
+            raise PeerLost(
+                "the vehicle",
+                f"its clock went back from {self._now_us / 1e6:.1f} s to {time_us / 1e6:.1f} s: it restarted",
+            )
         self._ever_heard = True
         self._now_us = max(self._now_us, time_us)
 

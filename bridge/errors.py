@@ -16,8 +16,6 @@ FroudeError
 Each keeps what it names as attributes, so a runner can record a refusal as a result instead of parsing text.
 """
 
-# ruff: noqa: N818  (the names say what happened; an Error suffix would add nothing)
-
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -96,9 +94,7 @@ class PeerSilent(LinkError):
         self.peer = peer
         self.waited_s = waited_s
         self.awaited = awaited
-        super().__init__(
-            f"{peer}: no sign of {awaited} within {waited_s:g} s" + (f". {remedy}" if remedy else "")
-        )
+        super().__init__(f"{peer}: no sign of {awaited} within {waited_s:g} s" + (f". {remedy}" if remedy else ""))
 
 
 class PeerLost(LinkError):
@@ -140,9 +136,7 @@ class NotReady(LinkError):
         self.peer = peer
         self.waited_s = waited_s
         self.missing = tuple(missing)
-        super().__init__(
-            f"{peer} is not ready after {waited_s:g} s; still missing: {', '.join(self.missing)}"
-        )
+        super().__init__(f"{peer} is not ready after {waited_s:g} s; still missing: {', '.join(self.missing)}")
 
 
 class CommandRefused(LinkError):

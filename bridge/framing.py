@@ -118,6 +118,14 @@ class FrameSplitter:
 
     def feed(self, data: bytes) -> list[Message]:
         """Return the good frames that these bytes complete, in order; never raises."""
+        if not self._rest and len(data) > HEADER_2 and data[0] == MAGIC_2 and len(data) == data[1] + HEADER_2 + 2:
+            # Nearly every datagram: one whole frame and nothing else.
+            message = self._read(data, 0)
+            if message.__class__ is Message and not self._adrift:
+                counters = self._counters
+                counters.received += 1
+                counters.heard(message.sysid, message.compid, message.seq)
+                return [message]
         return self._split(self._rest + data if self._rest else data, final=self._datagram)
 
     def flush(self) -> list[Message]:
@@ -185,9 +193,7 @@ class FrameSplitter:
         self._adrift = self._adrift or bad_bytes > 0
         return found, limit
 
-    def _give_up(
-        self, buffer: bytes, start: int, stop: int, suspects: list[tuple[int, int, _Verdict]]
-    ) -> int:
+    def _give_up(self, buffer: bytes, start: int, stop: int, suspects: list[tuple[int, int, _Verdict]]) -> int:
         """Count the frames from start to stop, none good; return the bytes that belong to no frame."""
         bad = stop - start
         for at, end, verdict in suspects:

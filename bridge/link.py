@@ -210,9 +210,7 @@ class LossyLink(Link):
 class _Damage:
     """What happens to datagrams in one direction."""
 
-    def __init__(
-        self, rng: Generator, *, loss: float, duplicate: float, reorder: float, corrupt: float
-    ) -> None:
+    def __init__(self, rng: Generator, *, loss: float, duplicate: float, reorder: float, corrupt: float) -> None:
         self._rng = rng
         self._loss, self._duplicate, self._reorder, self._corrupt = loss, duplicate, reorder, corrupt
         self._held: bytes | None = None
@@ -284,9 +282,7 @@ def open_link(url: str, *, connect_s: float = 3.0) -> Link:
 
         return SerialLink(*_device(url, parts))
     if parts.scheme == "memory":
-        raise LinkUrlError(
-            url, "a memory link has no end to open", "froude fly makes its own; leave --connect out"
-        )
+        raise LinkUrlError(url, "a memory link has no end to open", "froude fly makes its own; leave --connect out")
     raise LinkUrlError(
         url,
         f"unknown kind {parts.scheme!r}" if parts.scheme else "no kind of link in front of '://'",

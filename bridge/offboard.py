@@ -45,7 +45,7 @@ class OffboardSetpoints:
         loses control.)
         """
         server = self._server
-        if not server.is_for_us(msg):
+        if not server.is_for_us(msg) or not server.vehicle.parameters.get("MAV_FWDEXTSP"):
             return
         mask = msg.type_mask
         quat: tuple[float, float, float, float] | None = None if mask & _IGNORE_ATTITUDE else tuple(msg.q)

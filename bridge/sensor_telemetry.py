@@ -150,9 +150,7 @@ def servo_output_raw(source: Source) -> Fields:
 def actuator_output_status(source: Source) -> Fields:
     """ACTUATOR_OUTPUT_STATUS: the same PWM values with a mask of those in use."""
     autopilot = source.vehicle.autopilot
-    pwm = [
-        1000.0 + 1000.0 * motor if autopilot.armed else float(_PWM_DISARMED_US) for motor in autopilot.motors
-    ]
+    pwm = [1000.0 + 1000.0 * motor if autopilot.armed else float(_PWM_DISARMED_US) for motor in autopilot.motors]
     return {
         "time_usec": source.time_us,
         "active": (1 << len(pwm)) - 1,

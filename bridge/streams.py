@@ -56,7 +56,7 @@ STREAMS: dict[int, Stream] = {
             83,
             "ATTITUDE_TARGET",
             telemetry.attitude_target,
-            lambda source: source.vehicle.autopilot.attitude_sp.count,
+            lambda source: source.vehicle.autopilot.attitude_sp_count,
             _FALLBACK_US,
         ),
         Stream(93, "HIL_ACTUATOR_CONTROLS", sensor_telemetry.hil_actuator_controls),

@@ -218,9 +218,7 @@ def position_target_local_ned(source: Source) -> Fields:
         position_sp.yaw_rate,
     )
     fields: Fields = dict(zip(_POSITION_TARGET_MASK, values, strict=True))
-    fields["type_mask"] = sum(
-        bit for name, bit in _POSITION_TARGET_MASK.items() if fields[name] != fields[name]
-    )
+    fields["type_mask"] = sum(bit for name, bit in _POSITION_TARGET_MASK.items() if fields[name] != fields[name])
     fields["time_boot_ms"] = source.time_ms
     fields["coordinate_frame"] = 1
     return fields

@@ -98,7 +98,7 @@ class UdpLink(Link):
                 return None
             except OSError as error:
                 self._count(error)
-                continue
+                return None
             if sender == self._remote:
                 return data
             if self._open_port:
@@ -138,15 +138,16 @@ _NOBODY_THERE = {
 
 
 def resolve(url: str, host: str, port: int, kind: socket.SocketKind) -> tuple[socket.AddressFamily, Address]:
-    """Return the first address a host name stands for.
+    """Return the address a host name stands for, IPv4 if it has both: ground stations listen there.
 
     Raises:
         LinkUrlError: no such host.
     """
     try:
-        family, _, _, _, address = socket.getaddrinfo(host, port, type=kind)[0]
+        found = socket.getaddrinfo(host, port, type=kind)
     except (OSError, UnicodeError) as error:
         raise LinkUrlError(url, f"host {host!r} cannot be found ({error})", "Check its spelling") from None
+    family, _, _, _, address = min(found, key=lambda one: one[0] != socket.AF_INET)
     return family, address
 
 

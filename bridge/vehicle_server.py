@@ -206,9 +206,7 @@ class VehicleServer:
 
     def is_for_us(self, msg: Any, *, any_component: bool = False) -> bool:
         """Return whether a message's target is this vehicle, or everybody."""
-        return msg.target_system in (0, self.sysid) and (
-            any_component or msg.target_component in (0, self.compid)
-        )
+        return msg.target_system in (0, self.sysid) and (any_component or msg.target_component in (0, self.compid))
 
     def hears_gcs(self) -> bool:
         """Return whether a ground station is there on any link."""

@@ -183,7 +183,8 @@ def _scenario(args: argparse.Namespace) -> Scenario:
 
 
 def _fly(args: argparse.Namespace) -> int:
-    from scenarios.runner import MEMORY, RunOptions, run_scenario
+    from scenarios.one_flight import MEMORY
+    from scenarios.runner import RunOptions, run_scenario
 
     scenario = _scenario(args)
     options = RunOptions(

@@ -15,7 +15,6 @@ from sitl.errors import FileError, UsageError
 from sitl.keyed_table import nearest
 
 if TYPE_CHECKING:
-    from sitl.airframe import FlightGains
     from sitl.parameters import ParameterTable
 
 BUILT_IN = "gain_sets"
@@ -69,39 +68,9 @@ class GainSet:
         return GainSet(self.name, parameters, self.source, self.note, self.path)
 
 
-def upload_parameters(
-    gain_set: GainSet, axes: str, flight_gains: FlightGains | None
-) -> dict[str, float | int]:
-    """Everything to upload for a flight: the gain set, and what pitch flies meanwhile.
-
-    With the same unstable gains on both axes PX4's desaturation cuts roll before pitch: the cycle lives in
-    pitch and roll looks clean. So pitch flies gains that are known to fly unless the set says otherwise.
-
-    Args:
-        gain_set: the candidate, roll.
-        axes: "roll": pitch flies the airframe's flight gains; "both": the set is mirrored to pitch.
-        flight_gains: of the airframe; None leaves pitch at what the vehicle has.
-    """
-    if axes == "both":
-        return dict(gain_set.mirrored().parameters)
-    if flight_gains is None:
-        return dict(gain_set.parameters)
-    pitch: dict[str, float | int] = {
-        "MC_PITCH_P": flight_gains.k_phi,
-        "MC_PITCHRATE_P": flight_gains.kp,
-        "MC_PITCHRATE_I": flight_gains.ki,
-        "MC_PITCHRATE_D": flight_gains.kd,
-        "MC_PITCHRATE_K": 1.0,
-        "MC_PITCHRATE_FF": 0.0,
-    }
-    return pitch | dict(gain_set.parameters)
-
-
 def list_gain_sets() -> tuple[str, ...]:
     """Names of the gain set files that come with the program."""
-    return tuple(
-        sorted(p.name.removesuffix(".toml") for p in _library().iterdir() if p.name.endswith(".toml"))
-    )
+    return tuple(sorted(p.name.removesuffix(".toml") for p in _library().iterdir() if p.name.endswith(".toml")))
 
 
 def load_gain_sets(ref: str | Path) -> tuple[GainSet, ...]:
@@ -249,9 +218,7 @@ def _read_file(file: str) -> tuple[GainSet, ...]:
         return (_from_params(path),)
     if path.suffix == ".toml":
         return _from_toml(path)
-    raise FileError(
-        path, f"suffix {path.suffix!r} is not known", "Give a .toml or a QGroundControl .params file"
-    )
+    raise FileError(path, f"suffix {path.suffix!r} is not known", "Give a .toml or a QGroundControl .params file")
 
 
 def _from_toml(path: Path) -> tuple[GainSet, ...]:
@@ -261,9 +228,7 @@ def _from_toml(path: Path) -> tuple[GainSet, ...]:
             raise FileError(path, f"unknown key {key!r}", "Every set is a [[gain_set]] table")
     entries = data.get("gain_set")
     if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
-        raise FileError(
-            path, "holds no [[gain_set]]", "Write [[gain_set]] with name and [gain_set.parameters]"
-        )
+        raise FileError(path, "holds no [[gain_set]]", "Write [[gain_set]] with name and [gain_set.parameters]")
     sets = tuple(_set_from_table(entry, path, n) for n, entry in enumerate(entries, 1))
     slugs = [gain_set.slug for gain_set in sets]
     for gain_set in sets:
@@ -285,9 +250,7 @@ def _set_from_table(entry: dict[str, Any], path: Path, number: int) -> GainSet:
         raise FileError(path, f"gain_set {number} has no name", 'Write name = "..."')
     parameters = entry.get("parameters")
     if not isinstance(parameters, dict) or not parameters:
-        raise FileError(
-            path, f"gain set {name!r} has no parameters", "Write [gain_set.parameters] MC_ROLL_P = 6.5"
-        )
+        raise FileError(path, f"gain set {name!r} has no parameters", "Write [gain_set.parameters] MC_ROLL_P = 6.5")
     for key, value in parameters.items():
         _number(value, path, f"gain set {name!r}: {key}")
     return GainSet(name, dict(parameters), entry.get("source", ""), entry.get("note", ""), path)
@@ -325,17 +288,13 @@ def _from_params(path: Path) -> GainSet:
             elif kind == "9":
                 parameters[name] = float(value)
             else:
-                raise FileError(
-                    path, f"line {number}: {name} has type {kind!r}", "PX4 knows 6 (INT32), 9 (REAL32)"
-                )
+                raise FileError(path, f"line {number}: {name} has type {kind!r}", "PX4 knows 6 (INT32), 9 (REAL32)")
         except ValueError:
             what = "an integer" if kind == "6" else "a number"
             raise FileError(path, f"line {number}: {name} = {value!r} is not {what}", "Correct it") from None
         _number(parameters[name], path, f"line {number}: {name}")
     if not parameters:
-        raise FileError(
-            path, "holds no parameter", "Save it from QGroundControl: Parameters, Tools, Save to file"
-        )
+        raise FileError(path, "holds no parameter", "Save it from QGroundControl: Parameters, Tools, Save to file")
     return GainSet(path.stem, parameters, f"QGroundControl parameter file {path.name}", "", path)
 
 

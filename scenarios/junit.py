@@ -61,9 +61,7 @@ def junit_xml(run: RunRecord) -> bytes:
     if not run.complete:
         lines.append("The run was interrupted.")
     out.text = _text("\n".join(line for line in lines if line))
-    root = ET.Element(
-        "testsuites", {key: suite.attrib[key] for key in ("tests", "failures", "errors", "time")}
-    )
+    root = ET.Element("testsuites", {key: suite.attrib[key] for key in ("tests", "failures", "errors", "time")})
     root.append(suite)
     ET.indent(root)
     document: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)

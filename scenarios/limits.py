@@ -175,9 +175,7 @@ def _parse_limit(entry: Any, path: str | Path, key: str) -> Limit:
         if number is None:
             continue
         if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
-            raise FileError(
-                path, f"{key} ({name}): {bound} = {number!r} is not a finite number", "Write a number"
-            )
+            raise FileError(path, f"{key} ({name}): {bound} = {number!r} is not a finite number", "Write a number")
     low, high = entry.get("min"), entry.get("max")
     if low is None and high is None:
         raise FileError(path, f"{key} ({name}) has no bound", "Give min, max or both")
@@ -207,9 +205,8 @@ def judge(
     checked: dict[str, Metric] = {}
     for name, limit in applied.items():
         metric = by_name.get(name) or measured(name, None, "not measured in this scenario")
-        if metric.value is None:
-            outcome = Outcome.UNSET
-        else:
+        outcome = Outcome.UNSET
+        if metric.value is not None:
             outcome = Outcome.PASS if limit.holds(metric.value) else Outcome.FAIL
         checked[name] = dataclasses.replace(metric, limit=str(limit), outcome=outcome)
 

@@ -18,9 +18,7 @@ from scenarios.signals import Chirp, FloatArray, Part, Ramp, Sines
 from sitl.errors import FileError
 from sitl.keyed_table import KeyedTable, nearest
 
-MAX_TILT_DEG = (
-    45.0  # beyond it the thrust of a vehicle that hovers at half throttle no longer carries it for long
-)
+MAX_TILT_DEG = 45.0  # beyond it the thrust of a vehicle that hovers at half throttle no longer carries it for long
 MAX_DURATION_S = 600.0
 EPSILON_S = 1e-9  # set-point k is due at k / rate: rounding must not push it before its edge
 
@@ -102,9 +100,7 @@ def parse_manoeuvres(tables: Any, path: Path, setpoint_rate_hz: float) -> tuple[
             degrees, a duration or frequency out of range, or an edge between two set-points.
     """
     if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
-        raise FileError(
-            path, "holds no [[manoeuvre]]", 'Write [[manoeuvre]] kind = "step", amplitude_deg = 10.0'
-        )
+        raise FileError(path, "holds no [[manoeuvre]]", 'Write [[manoeuvre]] kind = "step", amplitude_deg = 10.0')
     made: list[Manoeuvre] = []
     for number, table in enumerate(tables):
         where = f"manoeuvre[{number}]"
@@ -132,9 +128,7 @@ def _parse(raw: dict[str, Any], path: Path, where: str, rate_hz: float) -> Manoe
     keys.table.finish()
     parts = (*signal, Ramp.level(return_s, 0)) if return_s else tuple(signal)
     _check_edges(parts, keys)
-    windows = (
-        _step_windows(parts) if kind in ("step", "doublet") else _track_windows(signal, return_s, rate_hz)
-    )
+    windows = _step_windows(parts) if kind in ("step", "doublet") else _track_windows(signal, return_s, rate_hz)
     return Manoeuvre(name, kind, parts, windows, {"kind": kind, **keys.read})
 
 

@@ -21,9 +21,7 @@ ROLL_GAINS = (
 """Shown first, in this order."""
 
 
-def markdown_table(
-    head: Sequence[str], rows: Iterable[Sequence[str]], text_columns: Iterable[int] = (0,)
-) -> str:
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], text_columns: Iterable[int] = (0,)) -> str:
     """A markdown table; columns are right-aligned unless they hold text."""
     left = set(text_columns)
     rules = [":---" if column in left else "---:" for column in range(len(head))]
@@ -53,12 +51,9 @@ def verdicts(run: RunRecord) -> str:
         ]
         for flight in run.flights
     ]
-    warnings = [
-        f"{flight.gain_set.name}: warning: {text}" for flight in run.flights for text in flight.warnings
-    ]
+    warnings = [f"{flight.gain_set.name}: warning: {text}" for flight in run.flights for text in flight.warnings]
     parts = [
-        f"### {passed} of {len(run.flights)} gain sets pass on {_vehicle_name(run)}, "
-        f"profile {run.scenario.profile}",
+        f"### {passed} of {len(run.flights)} gain sets pass on {_vehicle_name(run)}, profile {run.scenario.profile}",
         markdown_table(head, rows, text_columns=(0, 1, len(head) - 1)),
         own_gains_line(run),
         _bullets(["Bold: out of its limit.", *blank_cells(run.flights), *warnings]),
@@ -99,9 +94,7 @@ def flight_page(flight: FlightRecord) -> str:
         parts += ["## Limits", markdown_table(("metric", "value", "limit", "outcome"), rows, (0, 2, 3))]
     rest = [metric for metric in whole if metric.limit is None]
     if rest:
-        rows = [
-            [metric.name, _value(metric), metric.reason if metric.value is None else ""] for metric in rest
-        ]
+        rows = [[metric.name, _value(metric), metric.reason if metric.value is None else ""] for metric in rest]
         parts += ["## Also measured", markdown_table(("metric", "value", ""), rows, (0, 2))]
     parts += ["## Gains", gains_table([flight])]
     parts += [f"- {warning}" for warning in flight.warnings]
@@ -122,10 +115,8 @@ def _gain(value: float | None) -> str:
 
 def _value(metric: Metric) -> str:
     unit = METRICS.get(metric.name, (metric.unit, ""))[0]
-    if metric.value is None or not math.isfinite(metric.value):
-        text = number(metric.value)
-    else:
-        text = f"{metric.value:.3g}"
+    finite = metric.value is not None and math.isfinite(metric.value)
+    text = f"{metric.value:.3g}" if finite else number(metric.value)
     return text if unit == "1" or metric.value is None else f"{text} {unit}"
 
 

@@ -14,22 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scenarios.limits import LIMIT_CYCLE_RAD_S, Metric, Outcome, judge, measured
-
-__all__ = [
-    "LIMIT_CYCLE_RAD_S",
-    "Metric",
-    "Oscillation",
-    "Outcome",
-    "divergence",
-    "dominant_frequency",
-    "effort_metrics",
-    "judge",
-    "measured",
-    "oscillation",
-    "step_metrics",
-    "track_metrics",
-]
+from scenarios.limits import LIMIT_CYCLE_RAD_S, Metric, measured
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -192,9 +177,7 @@ def step_metrics(
         reason = hole or "the set-point does not step"
         return tuple(measured(name, None, reason, segment) for name in (*names, "droop_deg"))
     t = t_s[rows] - start_s
-    done = (
-        np.asarray(phi_rad[rows], dtype=np.float64) - phi_from_rad
-    ) / amplitude  # 0 before, 1 at the set-point
+    done = (np.asarray(phi_rad[rows], dtype=np.float64) - phi_from_rad) / amplitude  # 0 before, 1 at the set-point
     error_deg = math.degrees(abs(amplitude)) * (done - 1.0)
     tail = t >= end_s - start_s - LAST_S - 1e-6 if end_s - start_s >= LAST_S else None
     droop_deg = None if tail is None else _mean(t[tail], error_deg[tail])

@@ -50,7 +50,8 @@ def model_text(shown: dict[str, Any]) -> str:
             f"scaling {', '.join(shown['scaling']) or 'none'}"
         )
     lines.append(
-        f"  {shown['layout']}, {len(shown['rotors'])} rotors, {shown['mass_kg']:g} kg, diagonal {shown['diagonal_m']:g} m"
+        f"  {shown['layout']}, {len(shown['rotors'])} rotors, {shown['mass_kg']:g} kg, "
+        f"diagonal {shown['diagonal_m']:g} m"
     )
     lines += ["", "  derivative      value  unit        sigma %"]
     for name, value in shown["derivatives"].items():
@@ -69,5 +70,8 @@ def model_text(shown: dict[str, Any]) -> str:
         phase = margins["phase_margin_deg"]
         phase_text = "no limit" if phase is None else f"{phase:.1f} deg"
         lines.append(f"  {stable}, phase margin {phase_text}, delay margin {delay_text}")
-    lines += ["", "  assumed, not measured: " + ", ".join(f"{k} {v:g}" for k, v in shown["assumptions"].items())]
+    lines += [
+        "",
+        "  assumed, not measured: " + ", ".join(f"{k} {v:g}" for k, v in shown["assumptions"].items()),
+    ]
     return "\n".join(lines)

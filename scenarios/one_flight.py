@@ -38,15 +38,12 @@ from sitl.stability import loop_margins
 from sitl.vehicle import Vehicle, airframe_parameters
 from sitl.vehicle_spec import VehicleModel
 
-ATTITUDE_INTERVAL_US = 4000
 MEMORY = "memory://"
 
 _INTERVALS_US = {
-    sampler.ATTITUDE: ATTITUDE_INTERVAL_US,
-    sampler.ATTITUDE_TARGET: ATTITUDE_INTERVAL_US,
-    sampler.HIL_ACTUATOR_CONTROLS: ATTITUDE_INTERVAL_US,
+    **dict.fromkeys(sampler.SAMPLED, sampler.CRUISE_INTERVAL_US),
     sampler.LOCAL_POSITION_NED: 20_000,
-    sampler.CURRENT_MODE: 20_000,
+    sampler.CURRENT_MODE: 100_000,
 }
 _UNUSED_STREAMS = (4, 24, 26, 29, 31, 33, 36, 74, 85, 105, 111, 141, 147, 230, 241, 331)
 _READY_TIMEOUT_S = 60.0
@@ -228,7 +225,7 @@ class _Flight:
         client.upload(self._job.parameters)
 
     def _save(self, path: Path, values: Mapping[str, float | int]) -> None:
-        save_params(path, values)
+        save_params(path, values, ParameterTable())
 
     def _restore(self, client: Client) -> None:
         if not self._uploaded or self._restored:
@@ -283,7 +280,8 @@ class _Flight:
         try:
             if self._base is not None:
                 record.telemetry.to_parquet(
-                    self._base.with_name(self._base.name + ".parquet"), {"gain_set": record.gain_set.name, "vehicle": record.vehicle_spec}
+                    self._base.with_name(self._base.name + ".parquet"),
+                    {"gain_set": record.gain_set.name, "vehicle": record.vehicle_spec},
                 )
             if self._recorder is not None:
                 from scenarios.markdown import flight_page
@@ -313,9 +311,6 @@ def flown_margins(job: FlightJob) -> dict[str, Any]:
         kd=get("MC_ROLLRATE_D"),
         kff=get("MC_ROLLRATE_FF"),
     )
-    profile = replace(
-        job.profile, gyro_cutoff_hz=get("IMU_GYRO_CUTOFF"), dgyro_cutoff_hz=get("IMU_DGYRO_CUTOFF")
-    )
+    profile = replace(job.profile, gyro_cutoff_hz=get("IMU_GYRO_CUTOFF"), dgyro_cutoff_hz=get("IMU_DGYRO_CUTOFF"))
     lag_s = job.profile.motor_lag(job.model.assumptions.motor_lag_s)
     return asdict(loop_margins(job.model.derivatives, gains, profile, lag_s))
-

@@ -18,6 +18,7 @@ from bridge.errors import CommandRefused
 from scenarios.flight import Segment
 from scenarios.manoeuvres import EPSILON_S, Manoeuvre
 from scenarios.metrics import DIVERGED_RAD
+from scenarios.sampler import CRUISE_INTERVAL_US, FAST_INTERVAL_US, SAMPLED
 from scenarios.scenario import Scenario
 from sitl.modes import LandedState, Mode
 from sitl.rotation import from_euler
@@ -64,7 +65,11 @@ class Pilot:
     """
 
     def __init__(
-        self, client: Client, scenario: Scenario, say: Callable[[int, str], object], progress: Callable[[str], object]
+        self,
+        client: Client,
+        scenario: Scenario,
+        say: Callable[[int, str], object],
+        progress: Callable[[str], object],
     ) -> None:
         self._client = client
         self._scenario = scenario
@@ -88,8 +93,10 @@ class Pilot:
                 self._progress(manoeuvre.name)
                 self._stop()
                 self._into_offboard()
+                self._sample_every(FAST_INTERVAL_US)
                 self._gate(manoeuvre)
                 self._manoeuvre(manoeuvre)
+                self._sample_every(CRUISE_INTERVAL_US)
         except FlightEndedError as end:
             self.log.failure = str(end)
             self._say(2, f"flight ended: {end}")
@@ -186,6 +193,10 @@ class Pilot:
         if not client.wait_until(lambda: client.state.nav_state == Mode.OFFBOARD, 3.0):
             raise FlightEndedError("the vehicle accepted Offboard and did not enter it")
 
+    def _sample_every(self, interval_us: int) -> None:
+        for message_id in SAMPLED:
+            self._client.set_interval(message_id, interval_us)
+
     def _gate(self, manoeuvre: Manoeuvre) -> None:
         gate = self._scenario.gate
         quiet_since: list[int] = []
@@ -209,7 +220,10 @@ class Pilot:
             return now - quiet_since[0] >= gate.hold_s * 1e6
 
         if not self._client.wait_until(ready, gate.timeout_s):
-            note = f"{manoeuvre.name}: not level, still and at height within {gate.timeout_s:g} s{self._shaking()}; flown all the same"
+            note = (
+                f"{manoeuvre.name}: not level, still and at height within {gate.timeout_s:g} s{self._shaking()}; "
+                "flown all the same"
+            )
             self.log.notes.append(note)
             self._say(4, note)
 
@@ -259,7 +273,9 @@ class Pilot:
         elapsed = now_us - self._signal_start_us
         index = int(elapsed / self._period_us + EPSILON_S)
         phi_sp = float(self._signal[index]) if index < len(self._signal) else 0.0
-        self._next_us = self._signal_start_us + (index + 1) * self._period_us if len(self._signal) else now_us + self._period_us
+        self._next_us = (
+            self._signal_start_us + (index + 1) * self._period_us if len(self._signal) else now_us + self._period_us
+        )
         self._client.attitude_setpoint(from_euler(phi_sp, 0.0, self._psi), self._thrust())
 
     def _thrust(self) -> float:

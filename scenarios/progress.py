@@ -33,7 +33,11 @@ def progress_bar() -> Iterator[Callable[[Progress], object]]:
 
         def show(progress: Progress) -> None:
             bar.update(
-                task, description=progress.name, completed=progress.index, total=progress.count, phase=progress.phase
+                task,
+                description=progress.name,
+                completed=progress.index,
+                total=progress.count,
+                phase=progress.phase,
             )
 
         yield show

@@ -109,17 +109,6 @@ class RunFolder:
         files = {suffix.lstrip("."): self.flight_file(slug, suffix) for suffix in FLIGHT_SUFFIXES}
         return {kind: str(file.relative_to(self.path)) for kind, file in files.items() if file.is_file()}
 
-    def write(self, run: RunRecord, command: Sequence[str] = ()) -> None:
-        """Write `run.json`, then `compare.rrd`.
-
-        Raises:
-            FileError: one of them cannot be written; what was written before is kept.
-        """
-        from scenarios.recorder.comparison import record_compare
-
-        self.write_run_json(run, command)
-        record_compare(run, self.compare)
-
     def write_run_json(self, run: RunRecord, command: Sequence[str] = ()) -> Path:
         """Write `run.json`; may be called after every flight, the file is whole at any time.
 
@@ -135,9 +124,7 @@ class RunFolder:
         return self.run_json
 
 
-def run_object(
-    run: RunRecord, folder: RunFolder | None = None, command: Sequence[str] = ()
-) -> dict[str, Any]:
+def run_object(run: RunRecord, folder: RunFolder | None = None, command: Sequence[str] = ()) -> dict[str, Any]:
     """A run as plain data: what `run.json` holds and `--json` prints.
 
     No NaN and no infinity: such a value is null, and its reason says so.
@@ -297,9 +284,7 @@ def load_run(path: Path) -> dict[str, Any]:
     try:
         run = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
-        raise FileError(
-            file, f"cannot be read: {error.strerror or error}", "Give the folder of a run"
-        ) from error
+        raise FileError(file, f"cannot be read: {error.strerror or error}", "Give the folder of a run") from error
     except ValueError as error:
         raise FileError(file, f"is not JSON: {error}", "Give the folder of a run") from error
     version = run.get("schema_version") if isinstance(run, dict) else None

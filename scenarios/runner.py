@@ -127,8 +127,8 @@ def run_scenario(
 def plan(gain_set: GainSet, scenario: Scenario, model: VehicleModel, profile: Profile) -> FlightJob:
     """The parameters that flying a set means, checked against the vehicle's table.
 
-    Roll flies the set. Pitch flies the set mirrored (axes "both"), or what the set itself says of pitch, or the
-    airframe's own flight gains.
+    Roll flies the set. Pitch flies the set mirrored (axes "both") or the airframe's own flight gains, and in either
+    case what the set itself says of pitch.
 
     Raises:
         FileError: unknown parameter, NaN, negative or absurd gain.
@@ -136,14 +136,13 @@ def plan(gain_set: GainSet, scenario: Scenario, model: VehicleModel, profile: Pr
     table = ParameterTable(airframe_parameters(model, profile))
     warnings = check(gain_set, table)
     values: dict[str, float | int] = {}
+    own = model.airframe.flight_gains
     if scenario.axes == "both":
         values.update(gain_set.mirrored().parameters)
-    elif not any(name.startswith("MC_PITCH") for name in gain_set.parameters):
-        own = model.airframe.flight_gains
-        if own is not None:
-            values.update(_gains("PITCH", own))
-        else:
-            warnings.append(f"{model.airframe.name} has no flight gains of its own: pitch flies PX4's defaults")
+    elif own is not None:
+        values.update(_gains("PITCH", own))
+    else:
+        warnings.append(f"{model.airframe.name} has no flight gains of its own: pitch flies PX4's defaults")
     values.update(gain_set.parameters)
     typed: dict[str, tuple[float | int, ParameterType]] = {
         name: (value, table.spec(name).type) for name, value in values.items()
@@ -178,7 +177,10 @@ def _baseline(
     if any(flies_own(gain_set) for gain_set in gain_sets):
         return None
     gain_set = GainSet(
-        name=f"own {model.airframe.name}", parameters=wanted, source="the airframe's own flight gains", note="baseline"
+        name=f"own {model.airframe.name}",
+        parameters=wanted,
+        source="the airframe's own flight gains",
+        note="baseline",
     )
     return plan(gain_set, scenario, model, profile)
 
@@ -192,7 +194,8 @@ def _fly_all(
             name = job.gain_set.name
             try:
                 flown[index] = fly(
-                    job, lambda phase, i=index, n=name: progress(Progress(i, len(jobs), n, phase))  # type: ignore[misc]
+                    job,
+                    lambda phase, i=index, n=name: progress(Progress(i, len(jobs), n, phase)),  # type: ignore[misc]
                 )
             except FlightStoppedError as stop:
                 flown[index] = stop.record

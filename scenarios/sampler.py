@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -21,9 +22,15 @@ ATTITUDE_TARGET = 83
 HIL_ACTUATOR_CONTROLS = 93
 CURRENT_MODE = 436
 
+SAMPLED = (ATTITUDE, ATTITUDE_TARGET, HIL_ACTUATOR_CONTROLS)
+"""What a row is made of, streamed fast while something is measured and slower on the way there and back."""
+FAST_INTERVAL_US = 4_000
+CRUISE_INTERVAL_US = 10_000
+
 ROWS_PER_BATCH = 500
 _MOTORS_SHOWN = 8
 _MOTORS_SENT = 16
+_VALUES = 7 + 8 + 6 + _MOTORS_SENT + 2
 _NAN3 = (float("nan"),) * 3
 _NAN8 = (float("nan"),) * 8
 _NAN16 = (float("nan"),) * _MOTORS_SENT
@@ -42,7 +49,10 @@ class Sampler:
     """
 
     def __init__(
-        self, client: Client, inverse: npt.NDArray[np.float64], on_batch: Callable[[Columns], object] | None = None
+        self,
+        client: Client,
+        inverse: npt.NDArray[np.float64],
+        on_batch: Callable[[Columns], object] | None = None,
     ) -> None:
         self._state = client.state
         self._inverse = inverse
@@ -51,7 +61,8 @@ class Sampler:
         self._target: tuple[float, ...] = _NAN8
         self._position: tuple[float, ...] = _NAN3 + _NAN3
         self._motors: Sequence[float] = _NAN16
-        self._rows: list[tuple[float, ...]] = []
+        # flat numbers, not a list of rows: nothing for the garbage collector to walk through while flying
+        self._rows = array("d")
         self._batches: list[Columns] = []
         self.last_s = -1.0
         client.subscribe("ATTITUDE", self._on_attitude)
@@ -80,19 +91,19 @@ class Sampler:
         if self._attitude is None:
             return
         state = self._state
-        self._rows.append(
+        self._rows.extend(
             (*self._attitude, *self._target, *self._position, *self._motors, state.nav_state, state.armed)
         )
         self._attitude = None
-        if len(self._rows) >= ROWS_PER_BATCH:
+        if len(self._rows) >= ROWS_PER_BATCH * _VALUES:
             self.flush()
 
     def flush(self) -> None:
         """Hand over the finished rows."""
         if not self._rows:
             return
-        columns = self._columns(np.array(self._rows, dtype=np.float64))
-        self._rows = []
+        columns = self._columns(np.array(self._rows).reshape(-1, _VALUES))
+        self._rows = array("d")
         self._batches.append(columns)
         if self._on_batch is not None:
             self._on_batch(columns)

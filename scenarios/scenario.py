@@ -121,9 +121,7 @@ class Scenario:
         from sitl.vehicle_spec import resolve_vehicle
 
         model = resolve_vehicle(self.vehicle, self.scaling)
-        return dataclasses.replace(
-            model, assumptions=dataclasses.replace(model.assumptions, **self.assumptions)
-        )
+        return dataclasses.replace(model, assumptions=dataclasses.replace(model.assumptions, **self.assumptions))
 
 
 def list_scenarios() -> tuple[str, ...]:
@@ -185,9 +183,7 @@ def limit_set(name: str) -> tuple[Limit, ...]:
         UsageError: no such set.
     """
     if name not in LIMIT_SETS:
-        raise UsageError(
-            f'no limit set "{name}"{nearest(name, LIMIT_SETS)}; sets are {", ".join(LIMIT_SETS)}'
-        )
+        raise UsageError(f'no limit set "{name}"{nearest(name, LIMIT_SETS)}; sets are {", ".join(LIMIT_SETS)}')
     return LIMIT_SETS[name]
 
 
@@ -209,7 +205,7 @@ def _beside(scenario: Path, ref: str) -> str:
 
 def _profile(file: KeyedTable, data: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """`profile = "sitl"`, or a table [profile] with `name` and the items to replace."""
-    if "profile" not in file or isinstance(data["profile"], str):
+    if "profile" not in file or not isinstance(data["profile"], dict):
         return file.text("profile", "sitl"), {}
     file.table("profile")
     items = dict(data["profile"])

@@ -72,7 +72,7 @@ def margin_metrics(margins: Mapping[str, Any]) -> list[Metric]:
         "modulus_margin",
     )
     if margins["closed_loop_stable"]:
-        return [measured(name, margins[name], "no such limit") for name in names]
+        return [measured(n, margins[n], "no such limit" if margins[n] is None else "") for n in names]
     reason = "the linear loop is unstable"
     return [measured(n, None if n == "modulus_margin" else margins[n], reason) for n in names]
 
@@ -144,10 +144,7 @@ def _shake_metrics(shakes: Sequence[Oscillation], segment: str) -> list[Metric]:
     return [
         measured("oscillation_rad_s", worst.worst_rad_s, str(worst) if worst.is_limit_cycle else "", segment),
         measured("oscillation_hz", worst.frequency_hz, quiet, segment),
-        *(
-            measured(name, max(shake.std_rad_s[k] for shake in known), "", segment)
-            for k, name in enumerate(axes)
-        ),
+        *(measured(name, max(shake.std_rad_s[k] for shake in known), "", segment) for k, name in enumerate(axes)),
     ]
 
 

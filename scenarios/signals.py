@@ -69,9 +69,7 @@ class Sines:
         """Scaled so that the largest magnitude among the set-points sent at `rate_hz` is the peak."""
         unit = cls(duration_s, 1.0, frequencies_hz, phases_rad, fade_s)
         sent = unit.values(np.arange(round(duration_s * rate_hz)) / rate_hz)
-        return cls(
-            duration_s, math.radians(peak_deg) / float(np.abs(sent).max()), frequencies_hz, phases_rad, fade_s
-        )
+        return cls(duration_s, math.radians(peak_deg) / float(np.abs(sent).max()), frequencies_hz, phases_rad, fade_s)
 
     def values(self, t_s: FloatArray) -> FloatArray:
         """Roll set-point in rad at local times."""

@@ -124,8 +124,7 @@ def blank_cells(flights: Sequence[FlightRecord]) -> list[str]:
         for reason, columns in blanks.items():
             reasons.setdefault((reason, tuple(columns)), []).append(flight.gain_set.name)
     return [
-        f"{UNSET} {', '.join(columns)} ({', '.join(sets)}): {reason}"
-        for (reason, columns), sets in reasons.items()
+        f"{UNSET} {', '.join(columns)} ({', '.join(sets)}): {reason}" for (reason, columns), sets in reasons.items()
     ]
 
 
@@ -181,9 +180,7 @@ def assumption_lines(run: RunRecord) -> list[str]:
     profile = {item: value for item, value, _ in run.profile if value != "airframe"}
     lines = [f"{item} {_plain(value)}" for item, value in profile.items() if item != "name"]
     assumptions = run.vehicle.get("assumptions", {})
-    lines += [
-        f"{item} {_plain(value)} (assumed)" for item, value in assumptions.items() if item not in profile
-    ]
+    lines += [f"{item} {_plain(value)} (assumed)" for item, value in assumptions.items() if item not in profile]
     return lines
 
 
@@ -193,9 +190,7 @@ def _plain(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def run_text(
-    run: RunRecord, folder: Path | None = None, *, width: int | None = None, colour: bool = False
-) -> str:
+def run_text(run: RunRecord, folder: Path | None = None, *, width: int | None = None, colour: bool = False) -> str:
     """The whole result as text.
 
     Args:
@@ -252,9 +247,7 @@ def run_text(
 
 
 def _wrapped(text: str, columns: int, indent: str) -> str:
-    return textwrap.fill(
-        text, columns, subsequent_indent=indent, break_on_hyphens=False, break_long_words=False
-    )
+    return textwrap.fill(text, columns, subsequent_indent=indent, break_on_hyphens=False, break_long_words=False)
 
 
 def _rich_table(flights: Sequence[FlightRecord]) -> Any:
@@ -284,9 +277,5 @@ def terminal_width(stream: Any) -> tuple[int, bool]:
     import shutil
 
     terminal = bool(getattr(stream, "isatty", lambda: False)())
-    width = (
-        shutil.get_terminal_size((PIPED_WIDTH, 24)).columns
-        if terminal or "COLUMNS" in os.environ
-        else PIPED_WIDTH
-    )
+    width = shutil.get_terminal_size((PIPED_WIDTH, 24)).columns if terminal or "COLUMNS" in os.environ else PIPED_WIDTH
     return width, terminal and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"

@@ -76,9 +76,7 @@ _ALL = (
         )
         for n in range(1, 9)
     ),
-    _float(
-        "delta_lat", "1", "normalised roll torque that the motor commands produce (pseudo-inverse of the mix)"
-    ),
+    _float("delta_lat", "1", "normalised roll torque that the motor commands produce (pseudo-inverse of the mix)"),
     _float("delta_lon", "1", "normalised pitch torque that the motor commands produce"),
     Column("nav_state", "<i2", "", "PX4 navigation state (4 Hold, 14 Offboard, 17 Takeoff, 18 Land)", -1),
     Column("armed", "|b1", "", "armed, from HEARTBEAT", False),
@@ -186,9 +184,7 @@ class Telemetry:
             part.replace(path)
         except OSError as error:
             part.unlink(missing_ok=True)
-            raise FileError(
-                path, f"cannot be written: {error}", "Free some space or choose another --out"
-            ) from error
+            raise FileError(path, f"cannot be written: {error}", "Free some space or choose another --out") from error
 
     @classmethod
     def from_parquet(cls, path: str | Path) -> tuple[Telemetry, dict[str, Any]]:
@@ -203,9 +199,7 @@ class Telemetry:
         try:
             table = pq.read_table(path)
         except (OSError, pa.ArrowInvalid) as error:
-            raise FileError(
-                path, f"cannot be read as Parquet: {error}", "Give a flights/*.parquet of a run"
-            ) from error
+            raise FileError(path, f"cannot be read as Parquet: {error}", "Give a flights/*.parquet of a run") from error
         raw = (table.schema.metadata or {}).get(METADATA_KEY)
         if raw is None or set(table.column_names) != set(COLUMNS):
             raise FileError(path, "is not telemetry of froude", "Give a flights/*.parquet of a run")

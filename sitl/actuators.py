@@ -10,9 +10,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from sitl.compiled import compiled
 
 MAX_MOTORS = 12
 ROLL, PITCH, YAW, THRUST = 0, 1, 2, 3
@@ -97,7 +98,7 @@ def normalised_mix(rotors: Sequence[RotorEffect]) -> Mix:
     mix = np.linalg.pinv(effectiveness(rotors))
     n = len(rotors)
 
-    def column_scale(column: NDArray[np.float64]) -> float:
+    def column_scale(column: NDArray[np.floating]) -> float:
         used = int(np.count_nonzero(np.abs(column) > _WEAK_ENTRY))
         return math.sqrt(float(column @ column) / (used / 2.0)) if used else 1.0
 
@@ -118,8 +119,10 @@ def normalised_mix(rotors: Sequence[RotorEffect]) -> Mix:
     return Mix(columns=columns, inverse=np.linalg.pinv(columns))
 
 
-@numba.njit(cache=True)
-def _desaturation_gain(mix: NDArray[np.float64], axis: int, sign: float, motors: NDArray[np.float64], n: int, top: float) -> float:
+@compiled
+def _desaturation_gain(
+    mix: NDArray[np.float64], axis: int, sign: float, motors: NDArray[np.float64], n: int, top: float
+) -> float:
     low = 0.0
     high = 0.0
     for i in range(n):
@@ -137,9 +140,15 @@ def _desaturation_gain(mix: NDArray[np.float64], axis: int, sign: float, motors:
     return low + high
 
 
-@numba.njit(cache=True)
+@compiled
 def _desaturate(
-    mix: NDArray[np.float64], axis: int, sign: float, motors: NDArray[np.float64], n: int, top: float, increase_only: bool
+    mix: NDArray[np.float64],
+    axis: int,
+    sign: float,
+    motors: NDArray[np.float64],
+    n: int,
+    top: float,
+    increase_only: bool,
 ) -> None:
     gain = _desaturation_gain(mix, axis, sign, motors, n, top)
     if increase_only and gain < 0.0:
@@ -151,7 +160,7 @@ def _desaturate(
         motors[i] += gain * sign * mix[i, axis]
 
 
-@numba.njit(cache=True)
+@compiled
 def allocate(
     mix: NDArray[np.float64],
     n: int,
@@ -193,7 +202,7 @@ def allocate(
     _desaturate(mix, THRUST, -1.0, motors, n, 1.0, True)
 
 
-@numba.njit(cache=True)
+@compiled
 def saturation(
     inverse: NDArray[np.float64],
     n: int,
@@ -221,7 +230,7 @@ def saturation(
         negative[axis] = 1 if not achieved and missing[axis] < -_FLT_EPSILON else 0
 
 
-@numba.njit(cache=True)
+@compiled
 def motor_output(command: float, thr_mdl_fac: float) -> float:
     """Signal that makes a motor of curve f s^2 + (1 - f) s give the commanded thrust (THR_MDL_FAC)."""
     if 0.0 < thr_mdl_fac <= 1.0 and command > 0.0:

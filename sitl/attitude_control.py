@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import math
 
-import numba
-
+from sitl.compiled import compiled
 from sitl.rotation import Quat, Vec3, canonical, conjugate, multiply, normalise, to_body, to_world
 
 _INVERTED = 1.0 - 1e-5
 
 
-@numba.njit(cache=True)
+@compiled
 def reduced_attitude(quat: Quat, quat_sp: Quat) -> Quat:
     """The attitude that reaches the set-point's thrust direction by the shortest rotation, yaw left alone.
 
@@ -35,7 +34,7 @@ def reduced_attitude(quat: Quat, quat_sp: Quat) -> Quat:
     return multiply(tilt, quat)
 
 
-@numba.njit(cache=True)
+@compiled
 def attitude_error(quat: Quat, quat_sp: Quat, yaw_weight: float) -> Vec3:
     """Attitude error in body axes, rad for small errors (2 sin(angle/2) about a single axis).
 
@@ -54,7 +53,7 @@ def attitude_error(quat: Quat, quat_sp: Quat, yaw_weight: float) -> Vec3:
     return (2.0 * error[1], 2.0 * error[2], 2.0 * error[3])
 
 
-@numba.njit(cache=True)
+@compiled
 def attitude_control(
     quat: Quat, quat_sp: Quat, gain: Vec3, yaw_weight: float, rate_max: Vec3, yaw_rate_sp: float
 ) -> Vec3:
@@ -86,7 +85,7 @@ def attitude_control(
     )
 
 
-@numba.njit(cache=True)
+@compiled
 def linear_attitude_control(euler: Vec3, euler_sp: Vec3, gain: Vec3) -> Vec3:
     """The study's attitude hold, K_phi (phi_sp - phi), on each Euler angle alone (profile ``study``).
 

@@ -7,9 +7,10 @@ Every tick it hands the compiled control loop what to control; at 100 Hz it thin
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sitl import control_loop
 from sitl.control_loop import CONTROL_INPUT, CONTROL_STATE, control_tick
@@ -90,7 +91,7 @@ class Autopilot:
         self._input = np.zeros(1, CONTROL_INPUT)
         self._input["landed"] = True
         self.state = np.zeros(1, CONTROL_STATE)
-        self._outputs = self.state["outputs"][0]
+        self._outputs: NDArray[np.float64] = self.state["outputs"][0]
         self._quat_sp = self._input["quat_sp"][0]
         self._quat_sp[0] = 1.0
         self._position_state = np.zeros(1, POSITION_STATE)
@@ -140,10 +141,16 @@ class Autopilot:
         return LandedState.LANDING if self.mode is Mode.LAND else LandedState.IN_AIR
 
     @property
+    def attitude_sp_count(self) -> int:
+        """How many attitude set-points there have been: cheap to watch for a new one."""
+        return self._attitude_sp.count
+
+    @property
     def attitude_sp(self) -> AttitudeSetpoint:
         """Attitude set-point with the rate set-point that the attitude law now makes of it."""
         p, q, r = self.state["rates_sp"][0].tolist()
-        return replace(self._attitude_sp, rates=(p, q, r))
+        sp = self._attitude_sp
+        return AttitudeSetpoint(sp.time_us, sp.quat, (p, q, r), sp.thrust, sp.count)
 
     @property
     def position_sp(self) -> PositionSetpoint:
@@ -274,7 +281,7 @@ class Autopilot:
 
     # -- every tick --------------------------------------------------------------------------------------------
 
-    def tick(self, now_us: int) -> np.ndarray:
+    def tick(self, now_us: int) -> NDArray[np.float64]:
         """One tick on the sensors' newest sample.
 
         Args:
@@ -303,6 +310,8 @@ class Autopilot:
         self._settings = control_settings(table, self._profile, self._mix)
         self._position_settings = position_settings(table, self._profile)
         get = table.get
+        self._tilt_max_air = math.radians(float(get("MPC_TILTMAX_AIR")))
+        self._tilt_max_ground = math.radians(float(get("MPC_TILTMAX_LND")))
         self._land_limits = LandLimits(
             thr_min=float(get("MPC_THR_MIN")),
             hover_thrust=float(get("MPC_THR_HOVER")),
@@ -317,9 +326,15 @@ class Autopilot:
         home_down = self.home.position_ned[2] if self.home else 0.0
         dt_s = float(self._position_settings["dt_s"][0])
         contact = self.land_detector.ground_contact
+        flying = self.navigator.state is TakeoffState.FLIGHT
+        self._position_settings["tilt_max"] = self._tilt_max_air if flying else self._tilt_max_ground
         self.navigator.update(self._now_us, dt_s, self.mode, position, contact, home_down)
         position_tick(
-            self._position_settings, self.navigator.request, self._position_state, np.array(position), self._velocity_late
+            self._position_settings,
+            self.navigator.request,
+            self._position_state,
+            np.array(position),
+            self._velocity_late,
         )
         state = self._position_state[0]
         self._quat_sp[:] = state["quat_sp"]
@@ -335,7 +350,7 @@ class Autopilot:
     def remember_velocity(self) -> None:
         """Keep the velocity of this tick: the position controller sees it one tick late."""
         self._velocity_late[:] = self._velocity
-        self._velocity[:] = self._plant.velocity_ned()
+        self._velocity[:] = self._plant.velocity
 
     # -- 100 Hz ------------------------------------------------------------------------------------------------
 
@@ -355,13 +370,12 @@ class Autopilot:
             self._on_tilt()
         self._watch_offboard()
         self._watch_landing()
-        if self.mode is Mode.TAKEOFF and self.navigator.state is TakeoffState.FLIGHT:
-            north, east, down = self._plant.position_ned()
-            if self.navigator.reached(down):
-                target = self.navigator.target_down
-                self._switch(Mode.LOITER)
-                if target is not None:
-                    self.navigator.hold_ned[2] = target
+        flying = self.mode is Mode.TAKEOFF and self.navigator.state is TakeoffState.FLIGHT
+        if flying and self.navigator.reached(self._plant.position_ned()[2]):
+            target = self.navigator.target_down
+            self._switch(Mode.LOITER)
+            if target is not None:
+                self.navigator.hold_ned[2] = target
 
     def _motion(self) -> Motion:
         fx, fy, fz = self._plant.force.tolist()

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from sitl.actuators import MAX_MOTORS, allocate, motor_output, saturation
 from sitl.attitude_control import attitude_control, linear_attitude_control
+from sitl.compiled import Record, compiled
 from sitl.filters import biquad, settle_biquad
 from sitl.rate_control import rate_control
 from sitl.rotation import normalise, to_euler
@@ -96,8 +96,8 @@ CONTROL_STATE = np.dtype(
 """What a tick remembers; motors are commands in thrust space, outputs the signals sent to the motors."""
 
 
-@numba.njit(cache=True)
-def _filter_gyro(settings, state, gyro) -> None:  # type: ignore[no-untyped-def]
+@compiled
+def _filter_gyro(settings: Record, state: Record, gyro: NDArray[np.float64]) -> None:
     for axis in range(3):
         sample = gyro[axis]
         for i in range(settings.notch_count):
@@ -113,8 +113,8 @@ def _filter_gyro(settings, state, gyro) -> None:  # type: ignore[no-untyped-def]
         state.rates[axis] = rate
 
 
-@numba.njit(cache=True)
-def _estimate_attitude(settings, state, quat) -> None:  # type: ignore[no-untyped-def]
+@compiled
+def _estimate_attitude(settings: Record, state: Record, quat: NDArray[np.float64]) -> None:
     if state.started:
         for i in range(HISTORY - 1, 0, -1):
             for j in range(4):
@@ -139,8 +139,8 @@ def _estimate_attitude(settings, state, quat) -> None:  # type: ignore[no-untype
         state.attitude[j] = q[j]
 
 
-@numba.njit(cache=True)
-def _attitude_law(settings, request, state) -> None:  # type: ignore[no-untyped-def]
+@compiled
+def _attitude_law(settings: Record, request: Record, state: Record) -> None:
     if request.level == RATES:
         for axis in range(3):
             state.rates_sp[axis] = request.rates_sp[axis]
@@ -163,8 +163,8 @@ def _attitude_law(settings, request, state) -> None:  # type: ignore[no-untyped-
         state.rates_sp[axis] = wanted[axis]
 
 
-@numba.njit(cache=True)
-def _rate_law(settings, request, state) -> None:  # type: ignore[no-untyped-def]
+@compiled
+def _rate_law(settings: Record, request: Record, state: Record) -> None:
     for axis in range(3):
         if request.level == OFF:
             state.integral[axis] = 0.0
@@ -189,8 +189,8 @@ def _rate_law(settings, request, state) -> None:  # type: ignore[no-untyped-def]
     state.torque_sp[2] = state.yaw_torque
 
 
-@numba.njit(cache=True)
-def _allocation(settings, request, state) -> None:  # type: ignore[no-untyped-def]
+@compiled
+def _allocation(settings: Record, request: Record, state: Record) -> None:
     n = settings.motor_count
     if request.level == OFF:
         for i in range(MAX_MOTORS):
@@ -218,8 +218,14 @@ def _allocation(settings, request, state) -> None:  # type: ignore[no-untyped-de
         saturation(settings.inverse, n, state.torque_sp, state.motors, state.positive, state.negative)
 
 
-@numba.njit(cache=True)
-def control_tick(settings_array, input_array, state_array, gyro: NDArray[np.float64], quat: NDArray[np.float64]) -> None:  # type: ignore[no-untyped-def]
+@compiled
+def control_tick(
+    settings_array: NDArray[np.void],
+    input_array: NDArray[np.void],
+    state_array: NDArray[np.void],
+    gyro: NDArray[np.float64],
+    quat: NDArray[np.float64],
+) -> None:
     """Run one tick of gyro filter, attitude law, rate law and allocation, in PX4's order.
 
     Args:
@@ -229,9 +235,9 @@ def control_tick(settings_array, input_array, state_array, gyro: NDArray[np.floa
         gyro: (3,) measured body rates of this tick, rad/s.
         quat: (4,) true attitude of this tick, body to world.
     """
-    settings = settings_array[0]
-    request = input_array[0]
-    state = state_array[0]
+    settings: Record = settings_array[0]
+    request: Record = input_array[0]
+    state: Record = state_array[0]
     _filter_gyro(settings, state, gyro)
     _estimate_attitude(settings, state, quat)
     state.started = True

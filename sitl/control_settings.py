@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sitl.actuators import MAX_MOTORS, Mix, RotorEffect, normalised_mix
 from sitl.control_loop import CONTROL_SETTINGS
@@ -37,7 +38,7 @@ def mix_of(parameters: ParameterTable) -> Mix:
     )
 
 
-def control_settings(parameters: ParameterTable, profile: Profile, mix: Mix) -> np.ndarray:
+def control_settings(parameters: ParameterTable, profile: Profile, mix: Mix) -> NDArray[np.void]:
     """Settings of the control loop.
 
     Args:
@@ -95,7 +96,7 @@ def position_ticks(profile: Profile) -> int:
     return max(1, round(PERIOD_S * profile.rate_hz))
 
 
-def position_settings(parameters: ParameterTable, profile: Profile) -> np.ndarray:
+def position_settings(parameters: ParameterTable, profile: Profile) -> NDArray[np.void]:
     """Settings of the position controller.
 
     Args:

@@ -49,7 +49,16 @@ class TiltDetector:
     def __init__(self, parameters: ParameterTable) -> None:
         self._parameters = parameters
         self._since_us: list[int | None] = [None, None]
+        self._revision = -1
+        self._limits: tuple[tuple[float, float], ...] = ()
         self.failed = False
+
+    def _load(self) -> None:
+        get = self._parameters.get
+        self._revision = self._parameters.revision
+        self._limits = tuple(
+            (math.radians(float(get(f"FD_FAIL_{axis}"))), float(get(f"FD_FAIL_{axis}_TTRI")) * 1e6) for axis in "RP"
+        )
 
     def update(self, now_us: int, phi: float, theta: float, watched: bool) -> None:
         """Look once more.
@@ -62,14 +71,16 @@ class TiltDetector:
             self._since_us = [None, None]
             self.failed = False
             return
-        for axis, (name, angle) in enumerate((("R", phi), ("P", theta))):
-            limit = math.radians(float(self._parameters.get(f"FD_FAIL_{name}")))
+        if self._revision != self._parameters.revision:
+            self._load()
+        for axis, angle in enumerate((phi, theta)):
+            limit, patience_us = self._limits[axis]
             since = self._since_us[axis]
             if not limit > 0.0 or abs(angle) <= limit:
                 self._since_us[axis] = None
             elif since is None:
                 self._since_us[axis] = now_us
-            elif now_us - since >= float(self._parameters.get(f"FD_FAIL_{name}_TTRI")) * 1e6:
+            elif now_us - since >= patience_us:
                 self.failed = True
         if self._since_us == [None, None]:
             self.failed = False

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from sitl.compiled import compiled
 
 PASS_THROUGH = (1.0, 0.0, 0.0, 0.0, 0.0)
 """Biquad coefficients (b0, b1, b2, a1, a2) that change nothing."""
@@ -63,7 +64,7 @@ def alpha_of(cutoff_hz: float, dt_s: float) -> float:
     return dt_s / (dt_s + 1.0 / (2.0 * math.pi * cutoff_hz))
 
 
-@numba.njit(cache=True)
+@compiled
 def biquad(coefficients: NDArray[np.float64], delay: NDArray[np.float64], sample: float) -> float:
     """Next output of a biquad in direct form II.
 
@@ -73,13 +74,13 @@ def biquad(coefficients: NDArray[np.float64], delay: NDArray[np.float64], sample
         sample: next input.
     """
     w = sample - delay[0] * coefficients[3] - delay[1] * coefficients[4]
-    output = w * coefficients[0] + delay[0] * coefficients[1] + delay[1] * coefficients[2]
+    output: float = w * coefficients[0] + delay[0] * coefficients[1] + delay[1] * coefficients[2]
     delay[1] = delay[0]
     delay[0] = w
     return output
 
 
-@numba.njit(cache=True)
+@compiled
 def settle_biquad(coefficients: NDArray[np.float64], delay: NDArray[np.float64], sample: float) -> None:
     """Set a biquad's memory to where a constant input would have brought it (PX4's ``reset``).
 

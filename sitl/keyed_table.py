@@ -95,13 +95,9 @@ class KeyedTable:
         """
         if default is not None and key not in self:
             return default
-        return self._number(
-            key, self._take(key), at_least=at_least, at_most=at_most, above=above, below=below
-        )
+        return self._number(key, self._take(key), at_least=at_least, at_most=at_most, above=above, below=below)
 
-    def _number(
-        self, key: str, value: object, *, at_least: float, at_most: float, above: float, below: float
-    ) -> float:
+    def _number(self, key: str, value: object, *, at_least: float, at_most: float, above: float, below: float) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise self.error(key, f"{value!r} is not a number", "Give a number without quotes")
         try:
@@ -130,9 +126,7 @@ class KeyedTable:
         if not isinstance(value, list) or len(value) != count:
             raise self.error(key, f"{value!r} is not a list of {count} numbers")
         return tuple(
-            self._number(
-                f"{key}[{i}]", item, at_least=-math.inf, at_most=math.inf, above=above, below=math.inf
-            )
+            self._number(f"{key}[{i}]", item, at_least=-math.inf, at_most=math.inf, above=above, below=math.inf)
             for i, item in enumerate(value)
         )
 

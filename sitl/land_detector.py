@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 STAGE_US = 333_000
 """How long each stage must last, us."""
@@ -16,8 +17,7 @@ _LOW_THROTTLE = 0.6
 """Share of the way from minimum to hover thrust that still counts as low (hover thrust known)."""
 
 
-@dataclass(frozen=True)
-class Motion:
+class Motion(NamedTuple):
     """What the detector looks at.
 
     Attributes:

@@ -76,7 +76,11 @@ class Navigator:
         """
         brake = 2.0 * self._get("MPC_ACC_HOR")
         speed = math.hypot(velocity[0], velocity[1])
-        self.hold_ned = [position[0] + velocity[0] * speed / brake, position[1] + velocity[1] * speed / brake, position[2]]
+        self.hold_ned = [
+            position[0] + velocity[0] * speed / brake,
+            position[1] + velocity[1] * speed / brake,
+            position[2],
+        ]
         self.yaw = yaw
         self._climb = velocity[2]
         self.descending = False
@@ -100,7 +104,13 @@ class Navigator:
         return slow + share * (fast - slow)
 
     def update(
-        self, now_us: int, dt_s: float, mode: Mode, position: tuple[float, float, float], ground_contact: bool, home_down: float
+        self,
+        now_us: int,
+        dt_s: float,
+        mode: Mode,
+        position: tuple[float, float, float],
+        ground_contact: bool,
+        home_down: float,
     ) -> None:
         """Set-points for the next run of the position controller.
 

@@ -6,8 +6,6 @@ comes back bit for bit: a NaN with its payload, an infinity, a value outside the
 outside a value is.
 """
 
-# ruff: noqa: N818  (the names say what happened; an Error suffix would add nothing)
-
 from __future__ import annotations
 
 import difflib
@@ -37,8 +35,7 @@ _REAL32: Final = struct.Struct("<f")
 _NAME: Final = re.compile(r"[A-Z][A-Z0-9_]*\Z")
 _SERIES: Final = re.compile(r"\{(\d+)\.\.(\d+)\}")
 _KEYS: Final = frozenset(
-    {"default", "min", "max", "unit", "decimals", "increment"}
-    | {"reboot", "volatile", "short", "values", "obeyed"}
+    {"default", "min", "max", "unit", "decimals", "increment"} | {"reboot", "volatile", "short", "values", "obeyed"}
 )
 
 
@@ -132,7 +129,10 @@ def range_problem(spec: ParameterSpec, value: int | float) -> str | None:
         if (value - bound) * sign > 0:
             unit = f" {spec.unit}" if spec.unit else ""
             where = "below PX4's minimum" if sign < 0 else "above PX4's maximum"
-            ratio = f", {value / limit:.3g} times it" if limit and value / limit > 1 else ""
+            ratio = ""
+            if limit and value / limit > 1:
+                over = value / limit
+                ratio = f", {over:.3g} times it" if over >= 1.1 else f", {100 * (over - 1):.2g} % over"
             return f"{shown} is {where} of {limit:g}{unit} by {abs(value - limit):.4g}{unit}{ratio}"
     if spec.values and value not in spec.values:
         choices = ", ".join(f"{number} {text}" for number, text in spec.values.items())

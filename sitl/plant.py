@@ -18,13 +18,15 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from sitl.actuators import MAX_MOTORS, Mix
 from sitl.airframe import Assumptions, Derivatives
-from sitl.rotation import from_euler, to_euler
+from sitl.compiled import Record, compiled
+from sitl.rotation import from_euler, to_euler, to_world
+
+Floats = NDArray[np.float64]
 
 G_M_S2 = 9.81
 """Gravity that reproduces table 3.1 of the study to its printed digits, m/s^2."""
@@ -64,6 +66,7 @@ PLANT_STATE = np.dtype(
         ("force", "f8", (3,)),
         ("delta", "f8", (4,)),
         ("quat", "f8", (4,)),
+        ("velocity", "f8", (3,)),
         ("contact", "?"),
     ],
     align=True,
@@ -77,8 +80,8 @@ _GROUND_LEVELLING_DAMPING = 16.0
 _REST = G_M_S2 / _GROUND_STIFFNESS
 
 
-@numba.njit(cache=True)
-def _derivative(s, x, d, dx, force) -> bool:  # type: ignore[no-untyped-def]
+@compiled
+def _derivative(s: Record, x: Floats, d: Floats, dx: Floats, force: Floats) -> bool:
     u, v, w = x[3], x[4], x[5]
     p, q, r = x[10], x[11], x[12]
     force[0] = s.Yv * u - s.Yp * q - s.Yd * d[1]
@@ -110,7 +113,7 @@ def _derivative(s, x, d, dx, force) -> bool:  # type: ignore[no-untyped-def]
     dx[11] = -s.Lv * u + s.Lp * q + s.Ld * d[1]
     dx[12] = -s.yaw_damping * r + s.yaw_gain * d[2]
     depth = x[2] + _REST
-    contact = depth > 0.0
+    contact: bool = depth > 0.0
     if contact:
         # the reading of an accelerometer at rest on the ground is exactly -g: the contact force is a specific force
         push = max(0.0, _GROUND_STIFFNESS * depth + _GROUND_DAMPING * dx[2])
@@ -130,8 +133,8 @@ def _derivative(s, x, d, dx, force) -> bool:  # type: ignore[no-untyped-def]
     return contact
 
 
-@numba.njit(cache=True)
-def _torque(s, motors, d) -> None:  # type: ignore[no-untyped-def]
+@compiled
+def _torque(s: Record, motors: Floats, d: Floats) -> None:
     for axis in range(4):
         total = 0.0
         for i in range(s.motor_count):
@@ -139,8 +142,8 @@ def _torque(s, motors, d) -> None:  # type: ignore[no-untyped-def]
         d[axis] = total
 
 
-@numba.njit(cache=True)
-def _step(s, state, start, middle, end, h) -> None:  # type: ignore[no-untyped-def]
+@compiled
+def _step(s: Record, state: Record, start: Floats, middle: Floats, end: Floats, h: float) -> None:
     x = state.x
     k1, k2, k3, k4, y = np.empty(13), np.empty(13), np.empty(13), np.empty(13), np.empty(13)
     f1, f2, f3, f4 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -164,8 +167,8 @@ def _step(s, state, start, middle, end, h) -> None:  # type: ignore[no-untyped-d
             x[i] /= length
 
 
-@numba.njit(cache=True)
-def plant_tick(settings_array, state_array, commands: NDArray[np.float64]) -> None:  # type: ignore[no-untyped-def]
+@compiled
+def plant_tick(settings_array: NDArray[np.void], state_array: NDArray[np.void], commands: Floats) -> None:
     """Move the plant by one tick with the motors commanded at its start (after the transport delay).
 
     Args:
@@ -173,8 +176,8 @@ def plant_tick(settings_array, state_array, commands: NDArray[np.float64]) -> No
         state_array: (1,) of PLANT_STATE, updated in place; ``force`` is the mean specific force over the tick.
         commands: (MAX_MOTORS,) motor signals, fraction of full thrust.
     """
-    s = settings_array[0]
-    state = state_array[0]
+    s: Record = settings_array[0]
+    state: Record = state_array[0]
     for i in range(MAX_MOTORS):
         for k in range(s.delay_ticks, 0, -1):
             state.queue[k, i] = state.queue[k - 1, i]
@@ -209,6 +212,13 @@ def plant_tick(settings_array, state_array, commands: NDArray[np.float64]) -> No
             state.quat[i] = x[6 + i]
     for i in range(4):
         state.delta[i] = end[i]
+    if s.linear:
+        c, n = math.cos(x[8]), math.sin(x[8])
+        velocity = (c * x[3] - n * x[4], n * x[3] + c * x[4], x[5])
+    else:
+        velocity = to_world((x[6], x[7], x[8], x[9]), (x[3], x[4], x[5]))
+    for i in range(3):
+        state.velocity[i] = velocity[i]
 
 
 class Plant:
@@ -260,13 +270,14 @@ class Plant:
         self.quat = self.state["quat"][0]
         self.force = self.state["force"][0]
         self.delta = self.state["delta"][0]
+        self.velocity = self.state["velocity"][0]
         self.rates = self.x[10:13]
         self.quat[0] = 1.0
         if not linear:
             self.x[6] = 1.0
         self.force[2] = -G_M_S2
 
-    def step(self, commands: NDArray[np.float64]) -> None:
+    def step(self, commands: Floats) -> None:
         """Move by one tick.
 
         Args:
@@ -284,13 +295,8 @@ class Plant:
 
     def velocity_ned(self) -> tuple[float, float, float]:
         """Velocity north, east, down, m/s."""
-        u, v, w = self.x[3:6].tolist()
-        if self.linear:
-            c, s = math.cos(self.x[8]), math.sin(self.x[8])
-            return c * u - s * v, s * u + c * v, w
-        a, b, c, e = self.quat.tolist()
-        tx, ty, tz = 2.0 * (c * w - e * v), 2.0 * (e * u - b * w), 2.0 * (b * v - c * u)
-        return u + a * tx + c * tz - e * ty, v + a * ty + e * tx - b * tz, w + a * tz + b * ty - c * tx
+        north, east, down = self.velocity.tolist()
+        return north, east, down
 
     def position_ned(self) -> tuple[float, float, float]:
         """Position north, east, down of where it started, m."""

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+from numpy.typing import NDArray
+
+from sitl.compiled import Record, compiled
 
 PERIOD_S = 0.008
 
@@ -56,8 +58,8 @@ POSITION_STATE = np.dtype(
 _G = 9.80665
 
 
-@numba.njit(cache=True)
-def _attitude_from_thrust(thrust, yaw, quat) -> None:  # type: ignore[no-untyped-def]
+@compiled
+def _attitude_from_thrust(thrust: NDArray[np.float64], yaw: float, quat: NDArray[np.float64]) -> None:
     """Attitude whose -z axis points along a NED thrust vector, heading yaw."""
     length = math.sqrt(thrust[0] ** 2 + thrust[1] ** 2 + thrust[2] ** 2)
     if length < 1e-9:
@@ -87,13 +89,13 @@ def _attitude_from_thrust(thrust, yaw, quat) -> None:  # type: ignore[no-untyped
     quat[0], quat[1], quat[2], quat[3] = w, a, b, c
 
 
-@numba.njit(cache=True)
+@compiled
 def _limit(a: float, low: float, high: float) -> float:
     return min(high, max(low, a))
 
 
-@numba.njit(cache=True)
-def _thrust(s, state) -> tuple[float, float, float]:  # type: ignore[no-untyped-def]
+@compiled
+def _thrust(s: Record, state: Record) -> tuple[float, float, float]:
     """NED thrust vector (up is negative) for the wanted acceleration, tilt limited."""
     ax, ay, az = state.acc_sp[0], state.acc_sp[1], state.acc_sp[2]
     side = math.sqrt(ax * ax + ay * ay)
@@ -106,8 +108,14 @@ def _thrust(s, state) -> tuple[float, float, float]:  # type: ignore[no-untyped-
     return bx * collective, by * collective, bz * collective
 
 
-@numba.njit(cache=True)
-def position_tick(settings_array, input_array, state_array, position, velocity) -> None:  # type: ignore[no-untyped-def]
+@compiled
+def position_tick(
+    settings_array: NDArray[np.void],
+    input_array: NDArray[np.void],
+    state_array: NDArray[np.void],
+    position: NDArray[np.float64],
+    velocity: NDArray[np.float64],
+) -> None:
     """One run of the position controller.
 
     Args:
@@ -116,9 +124,9 @@ def position_tick(settings_array, input_array, state_array, position, velocity) 
         state_array: (1,) of POSITION_STATE; quat_sp and thrust_sp (0..1) are the result.
         position: (3,) NED, m. velocity: (3,) NED, m/s.
     """
-    s = settings_array[0]
-    request = input_array[0]
-    state = state_array[0]
+    s: Record = settings_array[0]
+    request: Record = input_array[0]
+    state: Record = state_array[0]
     for i in range(3):
         if not state.started:
             state.vel_prev[i] = velocity[i]

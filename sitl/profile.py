@@ -159,9 +159,7 @@ def get_profile(name: str, /, **overrides: object) -> Profile:
         UsageError: unknown profile or item, or a value of the wrong type or out of range; names all three.
     """
     if name not in PROFILES:
-        raise UsageError(
-            f'unknown profile "{name}"{nearest(name, PROFILES)}; profiles are {", ".join(PROFILES)}'
-        )
+        raise UsageError(f'unknown profile "{name}"{nearest(name, PROFILES)}; profiles are {", ".join(PROFILES)}')
     checked = {key: _check(name, key, value) for key, value in overrides.items()}
     return replace(PROFILES[name], **checked)  # type: ignore[arg-type]  # each value has passed _check
 

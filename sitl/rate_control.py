@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-import numba
+from sitl.compiled import compiled
 
 _I_FACTOR_RATE = math.radians(400.0)
 """Rate error at which the integrator stops altogether, rad/s."""
 
 
-@numba.njit(cache=True)
+@compiled
 def rate_control(
     rate: float,
     rate_sp: float,

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-import numba
+from sitl.compiled import compiled
 
 Quat = tuple[float, float, float, float]
 Vec3 = tuple[float, float, float]
 
 
-@numba.njit(cache=True)
+@compiled
 def multiply(a: Quat, b: Quat) -> Quat:
     """Hamilton product a b."""
     return (
@@ -21,13 +21,13 @@ def multiply(a: Quat, b: Quat) -> Quat:
     )
 
 
-@numba.njit(cache=True)
+@compiled
 def conjugate(a: Quat) -> Quat:
     """Inverse of a unit quaternion."""
     return (a[0], -a[1], -a[2], -a[3])
 
 
-@numba.njit(cache=True)
+@compiled
 def normalise(a: Quat) -> Quat:
     """The quaternion at unit length; (1, 0, 0, 0) if it has no length."""
     length = math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2] + a[3] * a[3])
@@ -36,7 +36,7 @@ def normalise(a: Quat) -> Quat:
     return (a[0] / length, a[1] / length, a[2] / length, a[3] / length)
 
 
-@numba.njit(cache=True)
+@compiled
 def canonical(a: Quat) -> Quat:
     """The one of the two equal quaternions with w >= 0."""
     if a[0] < 0.0:
@@ -44,7 +44,7 @@ def canonical(a: Quat) -> Quat:
     return a
 
 
-@numba.njit(cache=True)
+@compiled
 def to_world(q: Quat, v: Vec3) -> Vec3:
     """A body vector in world axes."""
     tx = 2.0 * (q[2] * v[2] - q[3] * v[1])
@@ -57,13 +57,13 @@ def to_world(q: Quat, v: Vec3) -> Vec3:
     )
 
 
-@numba.njit(cache=True)
+@compiled
 def to_body(q: Quat, v: Vec3) -> Vec3:
     """A world vector in body axes."""
     return to_world(conjugate(q), v)
 
 
-@numba.njit(cache=True)
+@compiled
 def from_euler(phi: float, theta: float, psi: float) -> Quat:
     """Quaternion of ZYX Euler angles, rad."""
     cr, sr = math.cos(phi / 2.0), math.sin(phi / 2.0)
@@ -77,7 +77,7 @@ def from_euler(phi: float, theta: float, psi: float) -> Quat:
     )
 
 
-@numba.njit(cache=True)
+@compiled
 def to_euler(q: Quat) -> Vec3:
     """ZYX Euler angles (phi, theta, psi) of a unit quaternion, rad."""
     phi = math.atan2(2.0 * (q[0] * q[1] + q[2] * q[3]), 1.0 - 2.0 * (q[1] * q[1] + q[2] * q[2]))

@@ -73,9 +73,7 @@ class SampledLoop:
         transport_delay_s: float = 0.0,
     ) -> None:
         if not (motor_lag_s >= 0.0 and transport_delay_s >= 0.0):
-            raise ValueError(
-                f"motor lag {motor_lag_s} s, transport delay {transport_delay_s} s: must be 0 or more"
-            )
+            raise ValueError(f"motor lag {motor_lag_s} s, transport delay {transport_delay_s} s: must be 0 or more")
         dt = profile.dt_s
         self.dt_s = dt
         self.gains = gains
@@ -94,7 +92,7 @@ class SampledLoop:
 
     @property
     def finite_at_zero(self) -> bool:
-        """Whether L has a value at frequency 0: no integrator, and no pole of the airframe at rest (Lv = 0)."""
+        """Whether L has a value at frequency 0: no integrator, no pole of the airframe at rest (Lv = 0)."""
         at_rest = np.abs(np.linalg.eigvals(self.phi) - 1.0).min() < 1e-12
         return self.gains.k * self.gains.ki == 0.0 and not bool(at_rest)
 
@@ -122,9 +120,9 @@ class SampledLoop:
         slope = (1.0 - lag) / self.dt_s * a / (1.0 - (1.0 - a) * lag)
         error = g.k * g.kp + (g.k * g.ki * self.dt_s / (z - 1.0) if g.k * g.ki else 0.0)
         attitude = g.k_phi * np.polynomial.polynomial.polyval(lag, self.late)
-        loop: ComplexArray = (error + g.k * g.kd * slope) * gyro * plant[..., P] + (
-            error + g.kff
-        ) * attitude * plant[..., PHI]
+        loop: ComplexArray = (error + g.k * g.kd * slope) * gyro * plant[..., P] + (error + g.kff) * attitude * plant[
+            ..., PHI
+        ]
         return loop
 
     def closed_loop_matrix(self, loop_gain: float = 1.0) -> FloatArray:

@@ -11,7 +11,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sitl.compiled import compiled
 from sitl.plant import G_M_S2, Plant
 from sitl.profile import Profile
 from sitl.rotation import to_body
@@ -55,6 +57,25 @@ def pressure_hpa(alt_m: float) -> float:
     return float(1013.25 * (1.0 - 2.25577e-5 * alt_m) ** 5.25588)
 
 
+@compiled
+def measure_gyro(
+    rates: NDArray[np.float64],
+    noise: NDArray[np.float64],
+    row: int,
+    quantum: float,
+    gyro: NDArray[np.float64],
+) -> None:
+    """Body rates plus noise, cut towards zero to whole quanta.
+
+    Args:
+        rates: (3,) true, rad/s. noise: (n, >=3), rad/s. row: of the noise. quantum: rad/s, 0 for exact.
+        gyro: (3,) output, rad/s.
+    """
+    for axis in range(3):
+        value = rates[axis] + noise[row, axis]
+        gyro[axis] = math.trunc(value / quantum) * quantum if quantum > 0.0 else value
+
+
 class Sensors:
     """The sensors of one vehicle.
 
@@ -70,7 +91,10 @@ class Sensors:
         self._noise = np.zeros((_BLOCK, 10))
         self._row = _BLOCK
         self._scale = np.array(
-            [profile.gyro_noise_rad_s] * 3 + [profile.accel_noise_m_s2] * 3 + [profile.mag_noise_gauss] * 3 + [profile.baro_noise_hpa]
+            [profile.gyro_noise_rad_s] * 3
+            + [profile.accel_noise_m_s2] * 3
+            + [profile.mag_noise_gauss] * 3
+            + [profile.baro_noise_hpa]
         )
         self._next_gps_us = 0
         self.gyro = np.zeros(3)
@@ -86,11 +110,7 @@ class Sensors:
         if self._row >= _BLOCK:
             self._noise = self._rng.standard_normal((_BLOCK, 10)) * self._scale
             self._row = 0
-        np.add(self._plant.rates, self._noise[self._row, :3], out=self.gyro)
-        quantum = self._profile.gyro_quantum_rad_s
-        if quantum > 0.0:
-            np.trunc(self.gyro / quantum, out=self.gyro)
-            self.gyro *= quantum
+        measure_gyro(self._plant.rates, self._noise, self._row, self._profile.gyro_quantum_rad_s, self.gyro)
         if now_us >= self._next_gps_us:
             self._next_gps_us += _GPS_PERIOD_US
             self._fix(now_us)

@@ -155,9 +155,7 @@ def _critical_gains(loop: SampledLoop, omega: FloatArray, value: ComplexArray) -
     return sorted(found, key=lambda critical: critical.gain)
 
 
-def _gain_range(
-    loop: SampledLoop, critical: list[_CriticalGain]
-) -> tuple[float | None, float | None, float | None]:
+def _gain_range(loop: SampledLoop, critical: list[_CriticalGain]) -> tuple[float | None, float | None, float | None]:
     """(low, high, frequency at high) of the nearest range of gain factors with a stable closed loop.
 
     Between two neighbouring critical gains no eigenvalue can cross the unit circle, so one look inside each
@@ -204,9 +202,7 @@ def _crossovers(loop: SampledLoop, omega: FloatArray, value: ComplexArray) -> li
     at = np.flatnonzero(above[:-1] != above[1:])
     roots = _zoom(lambda w: np.log(np.abs(loop.transfer(w))), omega[at], omega[at + 1])
     phase = (np.degrees(np.angle(loop.transfer(roots))) + 180.0) % 360.0
-    return [
-        _Crossover(float(w), float(p), bool(f)) for w, p, f in zip(roots, phase, above[:-1][at], strict=True)
-    ]
+    return [_Crossover(float(w), float(p), bool(f)) for w, p, f in zip(roots, phase, above[:-1][at], strict=True)]
 
 
 def _lead_to_stability(events: list[tuple[float, bool]], unstable: int, most: float) -> float | None:

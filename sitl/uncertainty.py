@@ -83,9 +83,7 @@ def _root(correlation: npt.ArrayLike) -> npt.NDArray[np.float64]:
     size = len(DERIVATIVE_NAMES)
     matrix = np.asarray(correlation, dtype=float)
     if matrix.shape != (size, size) or not np.all(np.isfinite(matrix)):
-        raise UsageError(
-            f"correlation: it must be {size} x {size} finite numbers ({', '.join(DERIVATIVE_NAMES)})"
-        )
+        raise UsageError(f"correlation: it must be {size} x {size} finite numbers ({', '.join(DERIVATIVE_NAMES)})")
     if not np.allclose(matrix, matrix.T, atol=1e-9) or not np.allclose(np.diag(matrix), 1.0, atol=1e-9):
         raise UsageError("correlation: it must be symmetric with ones on the diagonal")
     values, vectors = np.linalg.eigh(matrix)

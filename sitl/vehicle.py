@@ -129,7 +129,12 @@ class Vehicle:
     """
 
     def __init__(
-        self, model: VehicleModel, profile: Profile, *, seed: int = 0, parameters: ParameterTable | None = None
+        self,
+        model: VehicleModel,
+        profile: Profile,
+        *,
+        seed: int = 0,
+        parameters: ParameterTable | None = None,
     ) -> None:
         self.model = model
         self.profile = profile

@@ -103,8 +103,7 @@ def _scaling_words(scaling: Iterable[str]) -> frozenset[str]:
     for word in sorted(words):
         if word not in SCALING_WORDS:
             raise UsageError(
-                f'unknown scaling "{word}"{nearest(word, SCALING_WORDS)}; '
-                f"words are {', '.join(SCALING_WORDS)}"
+                f'unknown scaling "{word}"{nearest(word, SCALING_WORDS)}; words are {", ".join(SCALING_WORDS)}'
             )
     if {"uncertainty", "uncertainty-grow"} <= words:
         raise UsageError("scaling: uncertainty and uncertainty-grow are two ways of the same thing, give one")
@@ -117,7 +116,5 @@ def _split(spec: str) -> tuple[str | None, str]:
         return None, spec
     parts = spec.split(":")
     if len(parts) > 2 or not all(part.strip() for part in parts):
-        raise UsageError(
-            f'vehicle "{spec}" is neither an airframe nor REFERENCE:TARGET; write ant-x or ant-r:ant-x'
-        )
+        raise UsageError(f'vehicle "{spec}" is neither an airframe nor REFERENCE:TARGET; write ant-x or ant-r:ant-x')
     return (parts[0].strip(), parts[1].strip()) if len(parts) == 2 else (None, parts[0].strip())

@@ -75,9 +75,7 @@ def candidate_colour(index: int, rank: str) -> tuple[int, int, int, int]:
             would paint the plots full.
     """
     grey, opacity = {"oscillates": (0.5, 150), "failed": (0.3, 255)}.get(rank, (0.0, 255))
-    red, green, blue = (
-        round((1.0 - grey) * channel + grey * 110) for channel in PALETTE[index % len(PALETTE)]
-    )
+    red, green, blue = (round((1.0 - grey) * channel + grey * 110) for channel in PALETTE[index % len(PALETTE)])
     return red, green, blue, opacity
 
 
@@ -142,9 +140,7 @@ def _time_axis(page: Page | None) -> Any:
 def _lanes(page: Page | None = None) -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.StateTimelineView(
-        name="Flight mode and manoeuvre", origin="/state", time_view=_time_axis(page)
-    )
+    return rrb.StateTimelineView(name="Flight mode and manoeuvre", origin="/state", time_view=_time_axis(page))
 
 
 def _events() -> Any:
@@ -152,9 +148,7 @@ def _events() -> Any:
     from rerun.blueprint.encodings import TextLogColumn
 
     columns = [TextLogColumn("EntityPath", visible=False), TextLogColumn("LogLevel"), TextLogColumn("Body")]
-    return rrb.TextLogView(
-        name="Events", origin="/events", columns=rrb.TextLogColumns(text_log_columns=columns)
-    )
+    return rrb.TextLogView(name="Events", origin="/events", columns=rrb.TextLogColumns(text_log_columns=columns))
 
 
 def _blueprint(tabs: Sequence[Any], first: Page | None) -> Any:
@@ -191,7 +185,7 @@ def flight_blueprint(pages: Sequence[Page], whole: Page | None) -> Any:
     """
     tabs = [_manoeuvre(page) for page in pages]
     first = pages[0] if pages else None
-    return _blueprint([*tabs, _whole_flight(whole), _space(whole)], first)
+    return _blueprint([*tabs, _whole_flight(whole), _space(first or whole)], first)
 
 
 def _manoeuvre(page: Page) -> Any:
@@ -231,9 +225,7 @@ def _whole_flight(page: Page | None) -> Any:
 def _verdict_and_events() -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.Vertical(
-        rrb.TextDocumentView(name="Verdict", origin="/summary"), _events(), row_shares=[2.5, 1.0]
-    )
+    return rrb.Vertical(rrb.TextDocumentView(name="Verdict", origin="/summary"), _events(), row_shares=[2.5, 1.0])
 
 
 def _space(page: Page | None) -> Any:

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from scenarios.recorder.stream import TIMELINE, Colour, Recording
+from scenarios.recorder.stream import Colour, Recording
 
 PATH_STRIDE = 25
 """Every so many rows a corner of the path."""
@@ -56,24 +56,19 @@ class BodyView:
         diagonal = 2.0 * float(np.max(np.hypot(hubs[:, 0], hubs[:, 1]))) or 1.0
         self._arrow_m = ARROW_DIAGONALS * diagonal
         grey = (150, 150, 150)
-        stream = recording.stream
-        stream.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        recording.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         edge = float(GROUND_M)
         across = [[(-edge, float(y), 0.0), (edge, float(y), 0.0)] for y in range(-GROUND_M, GROUND_M + 1)]
         along = [[(x, y, z) for y, x, z in line] for line in across]
-        stream.log(
+        recording.log(
             "/world/ground",
             rr.LineStrips3D([*across, *along], radii=-0.5, colors=[(70, 70, 70)]),
-            static=True,
         )
-        stream.log(
+        recording.log(
             f"{BODY}/arms",
-            rr.LineStrips3D(
-                [[(0.0, 0.0, 0.0), tuple(hub)] for hub in hubs], radii=0.02 * diagonal, colors=[grey]
-            ),
-            static=True,
+            rr.LineStrips3D([[(0.0, 0.0, 0.0), tuple(hub)] for hub in hubs], radii=0.02 * diagonal, colors=[grey]),
         )
-        stream.log(
+        recording.log(
             f"{BODY}/rotors",
             rr.Cylinders3D(
                 lengths=[0.02 * diagonal] * len(hubs),
@@ -82,21 +77,18 @@ class BodyView:
                 colors=list(colours),
                 fill_mode="solid",
             ),
-            static=True,
         )
-        stream.log(
+        recording.log(
             f"{BODY}/front",
             rr.Arrows3D(
                 vectors=[(0.45 * diagonal, 0.0, 0.0)],
                 colors=[(235, 235, 235)],
                 radii=0.02 * diagonal,
             ),
-            static=True,
         )
-        stream.log(
+        recording.log(
             f"{BODY}/thrust",
             rr.Arrows3D.from_fields(origins=hubs, colors=list(colours), radii=0.015 * diagonal),
-            static=True,
         )
 
     def rows(
@@ -116,27 +108,17 @@ class BodyView:
         """
         import rerun as rr
 
-        stream = self._recording.stream
-        index = [rr.TimeColumn(TIMELINE, duration=time_s)]
+        recording = self._recording
         quat = enu_quaternions(columns["phi_rad"], columns["theta_rad"], columns["psi_rad"])
-        stream.send_columns(PLACE, index, rr.Transform3D.columns(translation=enu_m))
-        stream.send_columns(
-            BODY,
-            index,
-            rr.Transform3D.columns(quaternion=quat[:, (1, 2, 3, 0)]),
-        )
+        recording.columns(PLACE, time_s, rr.Transform3D.columns(translation=enu_m))
+        recording.columns(BODY, time_s, rr.Transform3D.columns(quaternion=quat[:, (1, 2, 3, 0)]))
         arrows = np.zeros((*motors.shape, 3))
         arrows[:, :, 2] = np.nan_to_num(motors) * self._arrow_m
-        stream.send_columns(
-            f"{BODY}/thrust",
-            index,
-            rr.Arrows3D.columns(vectors=arrows.reshape(-1, 3)).partition([motors.shape[1]] * len(time_s)),
-        )
+        thrust = rr.Arrows3D.columns(vectors=arrows.reshape(-1, 3)).partition([motors.shape[1]] * len(time_s))
+        recording.columns(f"{BODY}/thrust", time_s, thrust)
         self._corners.extend(enu_m[::PATH_STRIDE])
-        stream.set_time(TIMELINE, duration=float(time_s[0]))
-        stream.log(
-            "/world/path", rr.LineStrips3D([np.array(self._corners)], colors=[(86, 180, 233)], radii=[-1.5])
-        )
+        path = rr.LineStrips3D([np.array(self._corners)], colors=[(86, 180, 233)], radii=[-1.5])
+        recording.log("/world/path", path, float(time_s[0]))
 
 
 def enu_quaternions(phi: NDArray[Any], theta: NDArray[Any], psi: NDArray[Any]) -> NDArray[np.float64]:

@@ -91,9 +91,7 @@ def best_flight(flights: Sequence[FlightRecord]) -> FlightRecord | None:
 
     def rank(flight: FlightRecord) -> tuple[float, float]:
         values = [flight.metric(name) for name in ("rms_error_deg", "rise_time_s")]
-        error, rise = (
-            np.inf if metric is None or metric.value is None else metric.value for metric in values
-        )
+        error, rise = (np.inf if metric is None or metric.value is None else metric.value for metric in values)
         return error, rise
 
     return min(passed, key=rank) if passed else None
@@ -148,9 +146,7 @@ def _parts(flights: Sequence[FlightRecord], manoeuvre: str) -> list[_Part]:
             continue
         names = ("phi_sp_rad", "phi_rad", "p_rad_s", "delta_lat")
         phi_sp, phi, p, delta_lat = (rows[name].astype(np.float64) for name in names)
-        parts.append(
-            _Part(flight, number, rank, segments, rows["t_s"] - start, phi_sp * DEG, phi * DEG, p, delta_lat)
-        )
+        parts.append(_Part(flight, number, rank, segments, rows["t_s"] - start, phi_sp * DEG, phi * DEG, p, delta_lat))
     order = list(RANKS)
     return sorted(parts, key=lambda part: (order.index(part.rank), part.number))
 

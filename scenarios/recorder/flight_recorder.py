@@ -196,9 +196,7 @@ class FlightRecorder:
             widths=(1.0, 1.0, 1.5),
         )
         recording.style("/position", ("north [m]", "east [m]", "up [m]"), PALETTE[:3])
-        recording.style(
-            "/motors", [f"motor {n + 1} [0..1]" for n in range(self._motors)], self._motor_colours
-        )
+        recording.style("/motors", [f"motor {n + 1} [0..1]" for n in range(self._motors)], self._motor_colours)
 
     def _write_waiting(self) -> None:
         if not self._waiting_rows:

@@ -55,9 +55,7 @@ def screenshot(rrd: Path, png: Path, at_s: float | None = None, tab: str | None 
             if at_s is not None:
                 viewer.set_time(TIMELINE, duration=at_s, play_state="paused")
             image = _still_frame(viewer)
-            reports = [
-                f"{view.name}: {report}" for view in viewer.get_state().views for report in view.reports
-            ]
+            reports = [f"{view.name}: {report}" for view in viewer.get_state().views for report in view.reports]
     except (RuntimeError, OSError, ValueError) as error:
         raise UsageError(
             f"the Rerun viewer could not draw {rrd}: {error}. Without a graphics card it needs a software "
@@ -83,16 +81,12 @@ def _wait_loaded(viewer: Any) -> None:
 def _open_tab(viewer: Any, tab: str) -> None:
     current = viewer.get_blueprint()
     parts: dict[str, dict[str, dict[str, Any]]] = current.blueprint
-    containers = {
-        path: part["ContainerBlueprint"] for path, part in parts.items() if "ContainerBlueprint" in part
-    }
+    containers = {path: part["ContainerBlueprint"] for path, part in parts.items() if "ContainerBlueprint" in part}
     root = next((box for box in containers.values() if box.get("container_kind") == "Tabs"), {})
     names = {}
     for content in root.get("contents", ()):
         part = parts.get(f"/{content}", {})
-        names[(part.get("ContainerBlueprint") or part.get("ViewBlueprint") or {}).get("display_name", "")] = (
-            content
-        )
+        names[(part.get("ContainerBlueprint") or part.get("ViewBlueprint") or {}).get("display_name", "")] = content
     if tab not in names:
         raise UsageError(f"the recording has no tab {tab!r}; it has {', '.join(map(repr, names))}")
     root["active_tab"] = names[tab]

@@ -1,14 +1,14 @@
 """One Rerun file being written: opening, lines, lanes, texts, and the move to its final name.
 
-The file is the record of truth, so a viewer is never allowed to hold it up: a live view is served by
-ourselves on the loopback interface (`GrpcServerSink`). Pushing into a viewer (`GrpcSink`) beside a file
-stalls the file as soon as that viewer is slow or gone.
+The file is the record of truth, so a viewer is never allowed to hold it up: the live view is a stream of its
+own, into our own server. One stream with both a file and a `GrpcSink` stalls the file as soon as the receiver
+is slow or gone.
 """
 
 from __future__ import annotations
 
 import math
-import socket
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.errors import FileError, UsageError
+from scenarios.recorder import live
+from sitl.errors import FileError
 
 Colour = tuple[int, ...]
 """Red, green, blue and perhaps opacity, 0 to 255."""
@@ -25,8 +26,7 @@ TIMELINE = "flight_time"
 """The viewer follows one timeline in all views, so flights and comparisons call theirs the same."""
 
 LEAST_FREE_BYTES = 16_000_000
-LIVE_MEMORY = "256MB"
-"""What the live server keeps for a viewer that joins late."""
+LIVE_PATIENCE_S = 2.0
 _FOOTER = b"FOOT"
 """Ends the last bytes of a file that was finished."""
 
@@ -39,7 +39,7 @@ class Recording:
         application_id: the viewer keeps one layout per application id.
         recording_id: unique among the recordings that are opened together.
         name: as the viewer lists it.
-        live_port: also serve viewers on this port of 127.0.0.1.
+        live_port: also show it to the viewers of `live.serve(live_port)`.
 
     Raises:
         FileError: the file cannot be created, or the disk is nearly full.
@@ -54,21 +54,39 @@ class Recording:
         self.path = path
         self.partial = path.with_name(path.stem + ".partial.rrd")
         rr.set_strict_mode(True)  # otherwise a wrong argument is a line on stderr and a hole in the file
-        self.stream = rr.RecordingStream(application_id, recording_id=recording_id)
         _check_space(path)
-        sinks: list[Any] = [rr.FileSink(str(self.partial))]
+        self._file = rr.RecordingStream(application_id, recording_id=recording_id)
+        self._live: Any = None
         if live_port is not None:
-            _check_port(live_port)
-            sinks.append(rr.GrpcServerSink("127.0.0.1", live_port, server_memory_limit=LIVE_MEMORY))
+            uri = live.serve(live_port)
+            self._live = rr.RecordingStream(application_id, recording_id=recording_id)
+            self._live.set_sinks(rr.GrpcSink(uri))
         try:
-            self.stream.set_sinks(*sinks)
+            self._file.set_sinks(rr.FileSink(str(self.partial)))
         except RuntimeError as error:
-            raise FileError(
-                path, f"cannot be written: {error}", "Choose another folder with --out"
-            ) from error
-        self.stream.set_log_time_enabled(False)
-        self.stream.set_log_tick_enabled(False)
-        self.stream.send_recording_name(name)
+            raise FileError(path, f"cannot be written: {error}", "Choose another folder with --out") from error
+        for stream in self._streams:
+            stream.set_log_time_enabled(False)
+            stream.set_log_tick_enabled(False)
+            stream.send_recording_name(name)
+
+    @property
+    def _streams(self) -> tuple[Any, ...]:
+        return (self._file,) if self._live is None else (self._file, self._live)
+
+    def log(self, entity: str, thing: Any, time_s: float | None = None) -> None:
+        """Log one of Rerun's archetypes, at a time or (None) for always."""
+        for stream in self._streams:
+            if time_s is not None:
+                stream.set_time(TIMELINE, duration=time_s)
+            stream.log(entity, thing, static=time_s is None)
+
+    def columns(self, entity: str, time_s: NDArray[np.float64], columns: Any) -> None:
+        """Send many rows of Rerun's component columns; time_s is (n,)."""
+        import rerun as rr
+
+        for stream in self._streams:
+            stream.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=time_s)], columns)
 
     def style(
         self,
@@ -86,7 +104,7 @@ class Recording:
         """
         import rerun as rr
 
-        self.stream.log(
+        self.log(
             entity,
             rr.SeriesLines(
                 names=list(names),
@@ -95,7 +113,6 @@ class Recording:
                 aggregation_policy="MinMax",
                 interpolation_mode="StepAfter" if step else "Linear",
             ),
-            static=True,
         )
 
     def lines(self, entity: str, time_s: NDArray[np.float64], values: NDArray[np.float64]) -> None:
@@ -111,28 +128,25 @@ class Recording:
         scalars = rr.Scalars.columns(scalars=values.reshape(-1))
         if values.ndim == 2:
             scalars = scalars.partition([values.shape[1]] * len(time_s))
-        self.stream.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=time_s)], scalars)
+        self.columns(entity, time_s, scalars)
 
     def lane(self, entity: str, time_s: float, state: str) -> None:
         """The entity's state from this moment; empty ends the state before."""
         import rerun as rr
 
-        self.stream.set_time(TIMELINE, duration=time_s)
-        self.stream.log(entity, rr.StateChange(state=state))
+        self.log(entity, rr.StateChange(state=state), time_s)
 
     def text(self, entity: str, time_s: float, level: str, text: str) -> None:
         """A line of a log."""
         import rerun as rr
 
-        self.stream.set_time(TIMELINE, duration=time_s)
-        self.stream.log(entity, rr.TextLog(text, level=level))
+        self.log(entity, rr.TextLog(text, level=level), time_s)
 
     def document(self, entity: str, markdown: str) -> None:
         """A page of markdown, at no particular time."""
         import rerun as rr
 
-        self.stream.reset_time()
-        self.stream.log(entity, rr.TextDocument(markdown, media_type="text/markdown"), static=True)
+        self.log(entity, rr.TextDocument(markdown, media_type="text/markdown"))
 
     def properties(self, groups: Mapping[str, Mapping[str, Any]]) -> None:
         """Searchable facts: group -> name -> number or text; None and NaN are left out."""
@@ -144,12 +158,13 @@ class Recording:
                 for name, value in values.items()
                 if value is not None and not (isinstance(value, float) and math.isnan(value))
             }
-            if known:
-                self.stream.send_property(group, rr.AnyValues(**known))
+            for stream in self._streams if known else ():
+                stream.send_property(group, rr.AnyValues(**known))
 
     def layout(self, blueprint: Any) -> None:
         """The layout that the viewer opens with; the last one counts."""
-        self.stream.send_blueprint(blueprint)
+        for stream in self._streams:
+            stream.send_blueprint(blueprint)
 
     def finish(self) -> Path:
         """Write everything and give the file its name.
@@ -158,8 +173,8 @@ class Recording:
             FileError: not everything could be written; the partial file stays.
         """
         try:
-            self.stream.flush()
-            self.stream.disconnect()
+            self._file.flush()
+            self._file.disconnect()
             with self.partial.open("rb") as file:
                 file.seek(-64, 2)
                 whole = _FOOTER in file.read()
@@ -172,11 +187,22 @@ class Recording:
                 f"could not be finished: {error}",
                 f"Free some space; what was flown is in {self.partial}",
             ) from error
+        finally:
+            self._close_live()
         return self.path
 
     def abandon(self) -> None:
         """Stop: the partial file keeps what was written and opens in the viewer."""
-        self.stream.disconnect()
+        self._file.disconnect()
+        self._close_live()
+
+    def _close_live(self) -> None:
+        """A viewer that hangs would hold this up for half a minute: leave it to finish by itself."""
+        if self._live is not None:
+            closing = threading.Thread(target=self._live.disconnect, daemon=True)
+            closing.start()
+            closing.join(LIVE_PATIENCE_S)
+            self._live = None
 
 
 def _check_space(path: Path) -> None:
@@ -192,16 +218,3 @@ def _check_space(path: Path) -> None:
             f"cannot be written: {free / 1e6:.1f} MB are free on its disk",
             "Free some space or choose another --out",
         )
-
-
-def _check_port(port: int) -> None:
-    """Rerun only logs that its server's port is taken, and then shows nothing."""
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
-        except (OSError, OverflowError) as error:
-            raise UsageError(
-                f"live view: port {port} of 127.0.0.1 cannot be used: {error}; close the program that has it "
-                "(perhaps another viewer or run) or choose another port"
-            ) from error

@@ -50,9 +50,7 @@ def test_time_is_exact(tick_us: int, start_us: int, ticks: int) -> None:
 
 
 @given(tick_us=st.integers(1, 5000), until_us=st.integers(-1000, 100_000))
-def test_sleeping_on_simulated_time_runs_the_ticks_and_says_how_far_it_overshot(
-    tick_us: int, until_us: int
-) -> None:
+def test_sleeping_on_simulated_time_runs_the_ticks_and_says_how_far_it_overshot(tick_us: int, until_us: int) -> None:
     clock = SimClock(tick_us)
     ran: list[int] = []
     clock.every_tick(lambda: ran.append(clock.now_us()))
@@ -141,9 +139,7 @@ def test_stamps_sort_and_are_file_names() -> None:
 
 def test_nobody_else_asks_the_computer_for_the_time() -> None:
     found = []
-    for path in (
-        path for package in ("sitl", "bridge", "scenarios") for path in ROOT.glob(f"{package}/**/*.py")
-    ):
+    for path in (path for package in ("sitl", "bridge", "scenarios") for path in ROOT.glob(f"{package}/**/*.py")):
         if path.name == "froude_messages.py":  # generated; nothing in it runs but its tables
             continue
         for node in ast.walk(ast.parse(path.read_text())):

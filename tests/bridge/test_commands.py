@@ -150,15 +150,11 @@ class TestModes:
             ((1, 4, 11), "External 1"),
         ],
     )
-    def test_what_is_not_flown_is_refused_by_name(
-        self, on_ground: Any, params: tuple[float, ...], name: str
-    ) -> None:
+    def test_what_is_not_flown_is_refused_by_name(self, on_ground: Any, params: tuple[float, ...], name: str) -> None:
         assert on_ground.result(MODE, *params) == REJECTED
         (text,) = on_ground.ground.texts()
         assert text.startswith(f"{name} is not flown by this vehicle: ")
-        assert {"Hold", "Takeoff", "Land", "Offboard"} <= set(
-            text.partition(": ")[2].replace(",", "").split()
-        )
+        assert {"Hold", "Takeoff", "Land", "Offboard"} <= set(text.partition(": ")[2].replace(",", "").split())
 
     @pytest.mark.parametrize(
         ("params", "text"),
@@ -168,9 +164,7 @@ class TestModes:
             ((0,), "Unsupported base mode"),
         ],
     )
-    def test_what_px4_does_not_know_either(
-        self, on_ground: Any, params: tuple[float, ...], text: str
-    ) -> None:
+    def test_what_px4_does_not_know_either(self, on_ground: Any, params: tuple[float, ...], text: str) -> None:
         assert on_ground.result(MODE, *params) == REJECTED
         assert on_ground.ground.texts() == [text]
 
@@ -220,9 +214,7 @@ class TestTakeoff:
 
     def test_broken_place_of_a_command_int(self, on_ground: Any) -> None:
         bits = 0x7FF80000
-        (ack,) = on_ground.ask(
-            "COMMAND_INT", target_system=1, target_component=1, command=TAKEOFF, x=bits, y=bits
-        )
+        (ack,) = on_ground.ask("COMMAND_INT", target_system=1, target_component=1, command=TAKEOFF, x=bits, y=bits)
         assert ack.result == DENIED
 
 
@@ -245,9 +237,7 @@ class TestRequests:
         ],
     )
     def test_message_first_then_acknowledgement(self, on_ground: Any, message_id: float, name: str) -> None:
-        on_ground.ground.send(
-            "COMMAND_LONG", target_system=1, target_component=1, command=REQUEST, param1=message_id
-        )
+        on_ground.ground.send("COMMAND_LONG", target_system=1, target_component=1, command=REQUEST, param1=message_id)
         on_ground.run(0.02)
         heard = [one for _, one in on_ground.ground.heard]
         ack = next(index for index, one in enumerate(heard) if one.name == "COMMAND_ACK")
@@ -379,9 +369,7 @@ class TestStorage:
         assert on_ground.server.shutdown_asked
 
 
-_WILD = st.floats(width=32) | st.sampled_from(
-    [0.0, 1.0, 2.0, NAN, math.inf, -math.inf, 3e38, float(INT32_MAX)]
-)
+_WILD = st.floats(width=32) | st.sampled_from([0.0, 1.0, 2.0, NAN, math.inf, -math.inf, 3e38, float(INT32_MAX)])
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

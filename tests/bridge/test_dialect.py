@@ -104,9 +104,7 @@ def test_the_generated_file_is_what_the_xml_gives(tmp_path: Path, capsys: pytest
 
 def test_only_the_dialect_knows_pymavlink() -> None:
     importers = set()
-    for path in (
-        path for package in ("sitl", "bridge", "scenarios") for path in ROOT.glob(f"{package}/**/*.py")
-    ):
+    for path in (path for package in ("sitl", "bridge", "scenarios") for path in ROOT.glob(f"{package}/**/*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []

@@ -78,9 +78,7 @@ def test_every_good_frame_between_garbage_is_found(garbage: list[bytes], cuts: l
     change=st.integers(1, 255),
     cuts=cut_places,
 )
-def test_one_changed_byte_costs_at_most_its_own_frame(
-    damaged: int, place: int, change: int, cuts: list[int]
-) -> None:
+def test_one_changed_byte_costs_at_most_its_own_frame(damaged: int, place: int, change: int, cuts: list[int]) -> None:
     good = frames(8)
     broken = bytearray(good[damaged])
     broken[place % len(broken)] ^= change

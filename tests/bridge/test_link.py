@@ -230,9 +230,7 @@ class TestTcp:
             peer.send(data)
             assert exactly(server, len(data)) == data
 
-    def test_a_peer_that_reads_nothing_is_lost_and_holds_nobody_up(
-        self, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_a_peer_that_reads_nothing_is_lost_and_holds_nobody_up(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("bridge.tcp_link._STUCK_S", 0.01)
         with TcpLink.listen(LOCAL, 0) as server, TcpLink.connect(LOCAL, server.port) as peer:
             with pytest.raises(PeerLost, match="read nothing for"):
@@ -389,6 +387,12 @@ def test_a_bad_address_says_how_to_write_it(url: str, text: str) -> None:
         open_link(url)
     assert text in str(caught.value)
     assert caught.value.exit_status == 2
+
+
+def test_localhost_is_where_ground_stations_listen() -> None:
+    with UdpLink.listen(LOCAL, 0) as ground, open_link(f"udpout://localhost:{ground.port}") as vehicle:
+        vehicle.send(b"hello")
+        assert ground.recv(SOON_S) == b"hello"
 
 
 def test_every_kind_of_address_opens() -> None:

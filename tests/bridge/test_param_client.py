@@ -190,9 +190,7 @@ def test_a_refusal_for_another_ground_station_is_not_ours() -> None:
 def test_another_vehicles_answer_is_not_ours() -> None:
     wire = Wire(loss=1.0)
     operation = wire.set("MC_ROLL_P", 5.0)
-    other = Connection(2, 1).encode(
-        "PARAM_VALUE", param_id="MC_ROLL_P", param_value=5.0, param_type=9, param_count=1
-    )
+    other = Connection(2, 1).encode("PARAM_VALUE", param_id="MC_ROLL_P", param_value=5.0, param_type=9, param_count=1)
     wire._fly(False, other, 0)
     wire.tick()
     assert not operation.done
@@ -260,9 +258,7 @@ def test_an_echo_of_another_parameter_is_no_success() -> None:
     fields = {"param_value": struct.pack("<f", 5.0), "param_type": 9, "param_count": 9, "param_index": 1}
     wire.inject(0, "PARAM_VALUE", param_id="MC_PITCH_P", **fields)
     wire.inject(0, "PARAM_VALUE", param_id="MC_ROLL_P2", **fields)
-    wire.inject(
-        0, "PARAM_VALUE", param_id="MC_ROLL_P", **{**fields, "param_type": 6}
-    )  # same bits, other type
+    wire.inject(0, "PARAM_VALUE", param_id="MC_ROLL_P", **{**fields, "param_type": 6})  # same bits, other type
     wire.run(lambda: operation.done)
     assert result_of(operation).outcome is not Outcome.VERIFIED
 
@@ -341,9 +337,7 @@ def test_a_hundred_parameters_go_up_over_a_link_that_loses_three_of_ten(seed: in
     values=st.lists(st.sampled_from([1.0, 2.0, 3.0]), min_size=1, max_size=8),
     read_back=st.booleans(),
 )
-def test_verified_means_the_vehicle_holds_it(
-    seed: int, loss: float, values: list[float], read_back: bool
-) -> None:
+def test_verified_means_the_vehicle_holds_it(seed: int, loss: float, values: list[float], read_back: bool) -> None:
     """Few values, set again and again while packets double, vanish and overtake: no false success, ever."""
     wire = Wire(loss=loss, double=0.3, delay_s=0.4, seed=seed)
     for value in values:
@@ -457,9 +451,7 @@ def test_values_that_cannot_be_sent_are_refused_here() -> None:
 
 
 @given(seed=st.integers(0, 2**32), count=st.integers(0, 65535), index=st.integers(0, 65535), raw=FOUR_BYTES)
-def test_a_vehicle_that_talks_nonsense_never_breaks_the_client(
-    seed: int, count: int, index: int, raw: bytes
-) -> None:
+def test_a_vehicle_that_talks_nonsense_never_breaks_the_client(seed: int, count: int, index: int, raw: bytes) -> None:
     rng = random.Random(seed)
     wire = Wire(loss=1.0)
     reading = wire.client.start_read_all()

@@ -227,9 +227,7 @@ def test_list_is_paced(burst: int) -> None:
     ground = Ground()
     ground.server.add_link(GROUND, burst=burst)
     ground.ask("PARAM_REQUEST_LIST", 3.0)
-    groups = [
-        (time, len(list(group))) for time, group in itertools.groupby(ground.heard[GROUND], lambda x: x[0])
-    ]
+    groups = [(time, len(list(group))) for time, group in itertools.groupby(ground.heard[GROUND], lambda x: x[0])]
     assert all(size == burst for _, size in groups[:-1])
     gaps = [later[0] - earlier[0] for earlier, later in itertools.pairwise(groups)]
     assert min(gaps) >= 8_000  # the tick grid around 10 ms

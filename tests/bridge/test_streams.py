@@ -146,9 +146,7 @@ class TestAttitudeTarget:
         for tick in range(1, 101):
             if tick % 5 == 0:
                 source.count += 1
-            schedule.run(
-                tick * TICK_US, source, lambda name, _, t=tick: sent.append(t) if name != "HEARTBEAT" else 0
-            )
+            schedule.run(tick * TICK_US, source, lambda name, _, t=tick: sent.append(t) if name != "HEARTBEAT" else 0)
         assert sent == list(range(5, 101, 5))
 
     def test_is_limited_by_its_interval(self, source: Any) -> None:

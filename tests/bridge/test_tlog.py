@@ -62,6 +62,7 @@ def test_a_full_disk_is_one_clear_line() -> None:
     log = TlogWriter("/dev/full")
     with pytest.raises(FileError, match=r"No space left on device.*space left on the disk"):
         log.write(0, bytes(1_000_000))
-    with pytest.raises(FileError):
+    log.write(0, b"fits the buffer")
+    with pytest.raises(FileError, match="/dev/full: the telemetry log cannot be written"):
         log.close()
     log.close()

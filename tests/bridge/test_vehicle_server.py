@@ -335,7 +335,7 @@ class TestServices:
             param_value=7.25,
             param_type=9,
         )
-        assert [(one.name, one.param_id, one.param_value) for one in answers][0] == (
+        assert next((one.name, one.param_id, one.param_value) for one in answers) == (
             "PARAM_VALUE",
             "MC_ROLL_P",
             7.25,
@@ -418,9 +418,7 @@ class TestRobustness:
         assert both.grounds[0].counts()["ATTITUDE"] == 200
         assert both.links[0].peers == set()
 
-    def test_a_defect_is_counted_and_said_but_not_raised(
-        self, flight: Any, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_a_defect_is_counted_and_said_but_not_raised(self, flight: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         one = flight(strict=False)
         monkeypatch.setattr(one.autopilot, "offboard_attitude", lambda *_: 1 / 0)
         one.run(2.95, one.at_20_hz(one.set_point))
@@ -477,9 +475,7 @@ def _any_message(draw: Callable[..., Any], names: list[str]) -> tuple[str, dict[
         elif field.type == "char" or (field.count and field.type == "uint8_t"):
             fields[field.name] = draw(st.binary(max_size=field.size))
         elif field.count:
-            fields[field.name] = draw(
-                st.lists(_NUMBERS[field.type], min_size=field.count, max_size=field.count)
-            )
+            fields[field.name] = draw(st.lists(_NUMBERS[field.type], min_size=field.count, max_size=field.count))
         else:
             fields[field.name] = draw(_NUMBERS[field.type])
     return kind.name, fields
@@ -503,9 +499,7 @@ _HEARD = [
     "FILE_TRANSFER_PROTOCOL",
     "LOG_REQUEST_LIST",
 ]
-_SOCIABLE = settings(
-    max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+_SOCIABLE = settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @_SOCIABLE
@@ -520,9 +514,7 @@ def test_no_message_breaks_the_vehicle(on_ground: Any, message: tuple[str, dict[
 @given(data=st.data())
 def test_no_bytes_break_the_vehicle(on_ground: Any, data: Any) -> None:
     frame = bytearray(
-        Connection(255, 190).encode(
-            "COMMAND_LONG", target_system=1, target_component=1, command=511, param1=30.0
-        )
+        Connection(255, 190).encode("COMMAND_LONG", target_system=1, target_component=1, command=511, param1=30.0)
     )
     for _ in range(data.draw(st.integers(1, 4))):
         frame[data.draw(st.integers(0, len(frame) - 1))] = data.draw(st.integers(0, 255))

@@ -84,9 +84,7 @@ def test_the_scenario_may_set_its_own_oscillation_limit() -> None:
 
 
 def test_a_failed_flight_fails_whatever_was_measured() -> None:
-    outcome, reason, _ = judge(
-        GOOD, LIMIT_SETS["practical"], failure="diverged: roll beyond 80 deg at 12.00 s"
-    )
+    outcome, reason, _ = judge(GOOD, LIMIT_SETS["practical"], failure="diverged: roll beyond 80 deg at 12.00 s")
     assert outcome is Outcome.FAIL
     assert reason == "diverged: roll beyond 80 deg at 12.00 s"
 
@@ -108,9 +106,7 @@ def test_every_limit_set_limits_known_metrics() -> None:
 
 
 def test_parse_limits() -> None:
-    parsed = parse_limits(
-        [{"metric": "vaf_pct", "min": 60}, {"metric": "droop_deg", "min": -3, "max": 3}], "f"
-    )
+    parsed = parse_limits([{"metric": "vaf_pct", "min": 60}, {"metric": "droop_deg", "min": -3, "max": 3}], "f")
     assert parsed == (Limit("vaf_pct", 60.0), Limit("droop_deg", -3.0, 3.0))
     assert str(parsed[1]) == ">= -3 deg and <= 3 deg"
     assert parse_limits("study", "f") is LIMIT_SETS["study"]

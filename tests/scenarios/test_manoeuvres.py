@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -58,13 +59,13 @@ def test_doublet_is_the_recorded_flights_profile() -> None:
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-@pytest.mark.parametrize("rate_hz", [25.0, 50.0, 250.0])
+@pytest.mark.parametrize("rate_hz", [50.0, 100.0, 250.0])
 def test_windows_cover_the_manoeuvre_and_it_ends_level(kind: str, rate_hz: float) -> None:
     manoeuvre = make_manoeuvre(kind, setpoint_rate_hz=rate_hz, **EXAMPLES[kind])
     edges = [window.start_s for window in manoeuvre.windows] + [manoeuvre.windows[-1].end_s]
     assert edges[0] == 0.0
     assert edges[-1] == pytest.approx(manoeuvre.duration_s)
-    assert all(a < b for a, b in zip(edges, edges[1:], strict=False))
+    assert all(a < b for a, b in pairwise(edges))
     for edge in edges:
         assert edge * rate_hz == pytest.approx(round(edge * rate_hz), abs=1e-6)
     samples = manoeuvre.samples(rate_hz)
@@ -104,17 +105,14 @@ def test_chirp_sweeps_between_its_frequencies(sweep: str) -> None:
     )
     phi = chirp.samples(1000.0)
     ups = np.flatnonzero((phi[:-1] < 0) & (phi[1:] >= 0)) / 1000.0
-    periods = np.diff(ups)
-    assert 1 / periods[0] == pytest.approx(0.5, rel=0.15)
-    assert 1 / periods[-1] == pytest.approx(4.0, rel=0.05)
-    mean_hz = (4.0 - 0.5) / math.log(8) if sweep == "log" else 2.25
-    assert len(periods) == pytest.approx(20 * mean_hz, abs=2)
+    middle = (ups[:-1] + ups[1:]) / 2 / 20.0
+    expected = 0.5 * 8.0**middle if sweep == "log" else 0.5 + 3.5 * middle
+    assert len(middle) > 30
+    assert 1 / np.diff(ups) == pytest.approx(expected, rel=0.02)
 
 
 def test_multisine_has_its_peak_and_frequencies() -> None:
-    phi = np.degrees(make_manoeuvre("multisine", **(EXAMPLES["multisine"] | {"fade_s": 0.0})).samples(50.0))[
-        :500
-    ]
+    phi = np.degrees(make_manoeuvre("multisine", **(EXAMPLES["multisine"] | {"fade_s": 0.0})).samples(50.0))[:500]
     assert np.abs(phi).max() == pytest.approx(12.0)
     power = np.abs(np.fft.rfft(phi))
     assert sorted(np.argsort(power)[-3:] * 0.1) == pytest.approx([0.5, 1.1, 2.3])
@@ -178,16 +176,13 @@ def test_bad_lists_of_manoeuvres(tables: Any, text: str) -> None:
     assert text in str(error.value)
 
 
-@given(
-    st.dictionaries(st.sampled_from(["amplitude_deg", "hold_s", "return_s", "x"]), st.floats() | st.text())
-)
+@given(st.dictionaries(st.sampled_from(["amplitude_deg", "hold_s", "return_s", "x"]), st.floats() | st.text()))
 def test_any_keys_make_a_safe_manoeuvre_or_a_file_error(keys: dict[str, Any]) -> None:
     try:
         manoeuvre = make_manoeuvre("step", **keys)
-    except FileError as error:
-        assert str(error)
-    else:
-        samples = manoeuvre.samples(50.0)
-        assert np.isfinite(samples).all()
-        assert np.abs(samples).max() <= math.radians(45.0)
-        assert 0 < manoeuvre.duration_s <= 600
+    except FileError:
+        return
+    samples = manoeuvre.samples(50.0)
+    assert np.isfinite(samples).all()
+    assert np.abs(samples).max() <= math.radians(45.0)
+    assert 0 < manoeuvre.duration_s <= 600

@@ -57,14 +57,10 @@ T = np.arange(-0.5, 3.2, 0.004)
 def test_second_order_step(zeta: float) -> None:
     wn = 10.0
     got = values(step(T, A * second_order(T, zeta, wn)))
-    assert got["overshoot_pct"] == pytest.approx(
-        100 * math.exp(-math.pi * zeta / math.sqrt(1 - zeta**2)), abs=0.1
-    )
+    assert got["overshoot_pct"] == pytest.approx(100 * math.exp(-math.pi * zeta / math.sqrt(1 - zeta**2)), abs=0.1)
     fine = np.arange(0, 3, 1e-5)
     y = second_order(fine, zeta, wn)
-    assert got["rise_time_s"] == pytest.approx(
-        fine[np.argmax(y >= 0.9)] - fine[np.argmax(y >= 0.1)], abs=2e-4
-    )
+    assert got["rise_time_s"] == pytest.approx(fine[np.argmax(y >= 0.9)] - fine[np.argmax(y >= 0.1)], abs=2e-4)
     for name, band in (("settling_time_5pct_s", 0.05), ("settling_time_2pct_s", 0.02)):
         assert got[name] == pytest.approx(fine[np.abs(y - 1) > band][-1], abs=2e-4)
     assert got["droop_deg"] == pytest.approx(0.0, abs=2e-3)
@@ -138,9 +134,7 @@ def test_step_that_never_reaches_ninety_per_cent() -> None:
 def test_step_in_a_limit_cycle_means_nothing() -> None:
     p = 3.0 * np.sin(2 * math.pi * 8.4 * T)
     cycle = oscillation(T, p, 0 * T, 0 * T, start_s=0.0, end_s=3.0)
-    metrics = step_metrics(
-        T, A * np.ones_like(T), start_s=0.0, end_s=3.0, phi_from_rad=0.0, phi_to_rad=A, cycle=cycle
-    )
+    metrics = step_metrics(T, A * np.ones_like(T), start_s=0.0, end_s=3.0, phi_from_rad=0.0, phi_to_rad=A, cycle=cycle)
     unset = {metric.name for metric in metrics if metric.outcome is Outcome.UNSET}
     assert unset == {"overshoot_pct", "rise_time_s", "settling_time_5pct_s", "settling_time_2pct_s"}
     assert metrics[0].reason == "limit cycle 8.4 Hz, 2.1 rad/s in roll"
@@ -168,9 +162,7 @@ def test_dominant_frequency_of_one_second(hertz: float, uneven: bool) -> None:
 
 
 def test_oscillation_finds_the_axis_and_amplitude() -> None:
-    shake = oscillation(
-        T, 0.01 * np.sin(40 * T), 2.0 * np.sin(2 * math.pi * 21.2 * T), 0 * T, start_s=0, end_s=3
-    )
+    shake = oscillation(T, 0.01 * np.sin(40 * T), 2.0 * np.sin(2 * math.pi * 21.2 * T), 0 * T, start_s=0, end_s=3)
     assert shake.axis == "pitch"
     assert shake.worst_rad_s == pytest.approx(math.sqrt(2), rel=0.01)
     assert shake.frequency_hz == pytest.approx(21.2, abs=0.1)
@@ -226,10 +218,7 @@ def test_tracking_refuses_without_excitation_or_correlation() -> None:
     lost = {m.name: m for m in track_metrics(t, noise, A * np.sin(t), start_s=0, end_s=5)}
     assert lost["lag_s"].value is None
     assert "hardly correlate" in lost["vaf_lag_removed_pct"].reason
-    assert (
-        track_metrics(t, t, t + np.nan, start_s=0, end_s=5)[0].reason
-        == "the vehicle reported no roll set-point"
-    )
+    assert track_metrics(t, t, t + np.nan, start_s=0, end_s=5)[0].reason == "the vehicle reported no roll set-point"
 
 
 def test_effort_and_divergence() -> None:
@@ -269,9 +258,7 @@ def test_recorded_steps(
 ) -> None:
     c, _ = recorded(case)
     cycle = oscillation(c["t_s"], c["p_rad_s"], c["q_rad_s"], 0 * c["t_s"], start_s=0, end_s=3)
-    got = values(
-        step_metrics(c["t_s"], c["phi_rad"], start_s=0, end_s=3, phi_from_rad=0, phi_to_rad=A, cycle=cycle)
-    )
+    got = values(step_metrics(c["t_s"], c["phi_rad"], start_s=0, end_s=3, phi_from_rad=0, phi_to_rad=A, cycle=cycle))
     assert cycle.std_rad_s[0] == pytest.approx(p_std, abs=0.006)
     assert cycle.is_limit_cycle == (hertz is not None)
     if hertz is not None:

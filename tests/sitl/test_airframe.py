@@ -123,9 +123,7 @@ def test_carrier_1_s_file_tells_how_to_fly_it_as_an_x8(tmp_path: Path) -> None:
     number = r"([+-]\d+\.\d+)"
     found = re.findall(rf"px_m {number}  py_m {number}  km {number}", text)
     in_order = [*found[0::2], *found[1::2]]  # 1 to 4 are the left column, 5 to 8 the right one
-    rotors = "".join(
-        f"[[rotors]]\npx_m = {px}\npy_m = {py}\nkm = {km}\n".replace("+", "") for px, py, km in in_order
-    )
+    rotors = "".join(f"[[rotors]]\npx_m = {px}\npy_m = {py}\nkm = {km}\n".replace("+", "") for px, py, km in in_order)
     head = text[: text.index("\n[[rotors]]")].replace('layout = "octo"', 'layout = "X8"')
     x8 = load_text(f"{head}\n{rotors}", tmp_path)
     assert x8.layout == "X8"
@@ -140,9 +138,7 @@ def test_names_are_known_in_any_case(name: str) -> None:
 
 
 def test_an_unknown_name_lists_the_known_and_the_nearest() -> None:
-    with pytest.raises(
-        UsageError, match=r'"antx".*did you mean "ant-x".*adam-0, ant-r, ant-x, carrier-1.*toml'
-    ):
+    with pytest.raises(UsageError, match=r'"antx".*did you mean "ant-x".*adam-0, ant-r, ant-x, carrier-1.*toml'):
         load_airframe("antx")
 
 

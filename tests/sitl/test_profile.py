@@ -48,9 +48,9 @@ def test_one_item_is_overridden_alone() -> None:
     assert profile.motor_lag(0.025) == 0.01
     assert get_profile("study", motor_lag_s=None).motor_lag(0.025) == 0.025
     assert get_profile("sitl", gyro_cutoff_hz=100).gyro_cutoff_hz == 100.0
-    assert {
-        f.name for f in fields(Profile) if getattr(profile, f.name) != getattr(PROFILES["sitl"], f.name)
-    } == {"motor_lag_s"}
+    assert {f.name for f in fields(Profile) if getattr(profile, f.name) != getattr(PROFILES["sitl"], f.name)} == {
+        "motor_lag_s"
+    }
 
 
 @pytest.mark.parametrize(

@@ -120,9 +120,7 @@ def simulate(
     ("profile", "lag", "delay"),
     [(BARE, 0.0, 0.0), (SITL, 0.0, 0.0), (SITL, 0.025, 0.0), (BOARD, 0.01, 0.0), (SITL, 0.01, 0.0095)],
 )
-def test_the_matrix_of_one_tick_is_the_loop_flown_by_its_definition(
-    profile: Profile, lag: float, delay: float
-) -> None:
+def test_the_matrix_of_one_tick_is_the_loop_flown_by_its_definition(profile: Profile, lag: float, delay: float) -> None:
     d, g = derivatives("ADAM-0"), RollGains(6.5, 1.2, 0.15, 0.4, 0.003, 0.02)
     loop = SampledLoop(d, g, profile, lag, delay)
     matrix = loop.closed_loop_matrix()
@@ -349,9 +347,7 @@ def test_the_bare_loop_approaches_the_continuous_one_as_the_rate_rises(target: s
 @pytest.mark.parametrize(
     ("profile", "lag", "delay"), [(BARE, 0.0, 0.0), (SITL, 0.0, 0.0), (SITL, 0.02, 0.003), (BOARD, 0.01, 0.0)]
 )
-def test_loop_delay_is_the_phase_that_the_loop_s_elements_cost(
-    profile: Profile, lag: float, delay: float
-) -> None:
+def test_loop_delay_is_the_phase_that_the_loop_s_elements_cost(profile: Profile, lag: float, delay: float) -> None:
     """P control of the rate alone: L over the plant's own frequency response is those elements."""
     d, omega = derivatives("ANT-X"), 2.0
     gains = RollGains(k_phi=0.0, k=1.0, kp=0.1, ki=0.0, kd=0.0)

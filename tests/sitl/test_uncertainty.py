@@ -30,9 +30,7 @@ def test_gaussian_is_the_truncated_normal_distribution() -> None:
     from scipy.stats import kstest, truncnorm
 
     for spread in (1.0, 3.0):
-        z = deviations(
-            sample_derivatives(NOMINAL, SIGMA, 4000, np.random.default_rng(2), spread_sigma=spread)
-        )
+        z = deviations(sample_derivatives(NOMINAL, SIGMA, 4000, np.random.default_rng(2), spread_sigma=spread))
         for column in z.T:
             assert kstest(column, truncnorm(-spread, spread).cdf).pvalue > 1e-3
         assert np.abs(np.corrcoef(z.T) - np.eye(6)).max() < 0.08
@@ -41,9 +39,7 @@ def test_gaussian_is_the_truncated_normal_distribution() -> None:
 def test_uniform_is_flat_between_the_bounds() -> None:
     from scipy.stats import kstest, uniform
 
-    z = deviations(
-        sample_derivatives(NOMINAL, SIGMA, 4000, np.random.default_rng(3), 2.0, distribution="uniform")
-    )
+    z = deviations(sample_derivatives(NOMINAL, SIGMA, 4000, np.random.default_rng(3), 2.0, distribution="uniform"))
     for column in z.T:
         assert kstest(column, uniform(-2.0, 4.0).cdf).pvalue > 1e-3
 
@@ -71,9 +67,7 @@ def test_correlated_derivatives_move_together_in_their_own_signs() -> None:
 
 
 def test_fully_correlated_derivatives_move_as_one() -> None:
-    z = deviations(
-        sample_derivatives(NOMINAL, SIGMA, 50, np.random.default_rng(5), correlation=np.ones((6, 6)))
-    )
+    z = deviations(sample_derivatives(NOMINAL, SIGMA, 50, np.random.default_rng(5), correlation=np.ones((6, 6))))
     assert z == pytest.approx(np.repeat(z[:, :1], 6, axis=1), abs=1e-6)
 
 

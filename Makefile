@@ -1,0 +1,84 @@
+# Two commands do everything on a machine with Python 3.11, 3.12 or 3.13:
+#   make demo   set up what flying needs, then fly the demo
+#   make test   set up what testing needs, then run every check and test
+# Everything lives in $(VENV); `make clean` removes it. Another Python: make PYTHON=python3.12 demo
+
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+PIP    := $(BIN)/python -m pip --disable-pip-version-check --no-input install --quiet --constraint constraints.txt
+
+# One stamp per step: a step is repeated only when pyproject.toml or constraints.txt has changed.
+MADE   := $(VENV)/.made
+FLIES  := $(VENV)/.flies
+TESTS  := $(VENV)/.tests
+
+# Packages of the system are installed by root only, and only when they are missing.
+APT     = DEBIAN_FRONTEND=noninteractive apt-get
+AS_ROOT = [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null
+
+.PHONY: help demo test bench lint install install-test vulkan clean
+.DELETE_ON_ERROR:
+
+help:
+	@echo "make demo    set up, then fly six gain sets on ANT-X and print which pass"
+	@echo "make test    set up, then run all checks and tests"
+	@echo "make lint    set up, then run ruff, mypy and the import contracts only"
+	@echo "make bench   set up, then measure speed"
+	@echo "make clean   remove $(VENV) and every cache; logs/ is kept"
+
+demo: $(FLIES)
+	@echo "==> flying the demo (the first flight compiles the control laws: up to half a minute)"
+	@$(BIN)/froude fly
+
+test: lint vulkan
+	@echo "==> tests"
+	@$(BIN)/python -m pytest --numprocesses=auto --dist=loadfile
+
+lint: $(TESTS)
+	@echo "==> ruff"
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@echo "==> mypy"
+	@$(BIN)/mypy
+	@echo "==> import contracts"
+	@$(BIN)/lint-imports --no-logo --no-cache
+
+bench: $(TESTS)
+	@$(BIN)/python -m pytest tests/bench -o python_files='bench_*.py' --capture=no --quiet
+
+install: $(FLIES)
+
+install-test: $(TESTS)
+
+$(MADE):
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || { \
+	  echo "froude needs Python 3.11, 3.12 or 3.13; '$(PYTHON)' is $$($(PYTHON) --version 2>&1). Name another: make PYTHON=python3.11 ..." >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+	  { $(AS_ROOT) && echo "==> installing Debian's python3-venv" && $(APT) update -qq && \
+	    $(APT) install -y -qq --no-install-recommends python3-venv >/dev/null; } || { \
+	  echo "'$(PYTHON) -m venv' does not work here. As root: apt-get install python3-venv" >&2; exit 1; }; }
+	@echo "==> making $(VENV)"
+	@$(PYTHON) -m venv --clear $(VENV)
+	@touch $@
+
+$(FLIES): $(MADE) pyproject.toml constraints.txt
+	@echo "==> installing froude and what it flies with (numba, Rerun, Arrow and others: 1.1 GB on disk, about a minute)"
+	@$(PIP) --editable .
+	@touch $@
+
+$(TESTS): $(FLIES)
+	@echo "==> installing what the tests need (MAVSDK, MAVProxy, mypy and others: 1.3 GB more, about a minute)"
+	@$(PIP) --editable '.[test]'
+	@touch $@
+
+# The test of the recordings' pictures draws with a software Vulkan driver. Without one it is skipped, and says so.
+vulkan:
+	@ls /usr/share/vulkan/icd.d/*.json /etc/vulkan/icd.d/*.json >/dev/null 2>&1 || { \
+	  $(AS_ROOT) && echo "==> installing Debian's mesa-vulkan-drivers" && { \
+	  { $(APT) update -qq && $(APT) install -y -qq --no-install-recommends mesa-vulkan-drivers libvulkan1 >/dev/null; } \
+	    || echo "    not possible; the picture test will be skipped"; }; } || true
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	find sitl bridge scenarios tests -name __pycache__ -type d -prune -exec rm -rf {} +
