@@ -309,6 +309,14 @@ class Client:
         """Stream a message at an interval in us; -1 stops it, 0 is the default."""
         self.command(f"interval of message {message_id}", CMD_SET_MESSAGE_INTERVAL, message_id, interval_us)
 
+    def try_interval(self, message_id: int, interval_us: float) -> bool:
+        """As `set_interval`, for a message the vehicle may not have; whether it has."""
+        try:
+            self.set_interval(message_id, interval_us)
+        except CommandRefused:
+            return False
+        return True
+
     def request(self, message_id: int) -> None:
         """Ask for one message once."""
         self.command(f"request of message {message_id}", CMD_REQUEST_MESSAGE, message_id)

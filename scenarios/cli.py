@@ -98,9 +98,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     args.argv = list(sys.argv[1:] if argv is None else argv)
     if args.version:
-        from scenarios.runner import versions
+        from importlib.metadata import version
 
-        print(f"froude {versions()['froude']}")
+        print(f"froude {version('froude')}")
         return EXIT_OK
     if args.command is None:
         parser.print_help()
@@ -166,6 +166,7 @@ def _model(args: argparse.Namespace) -> int:
 
 def _scenario(args: argparse.Namespace) -> Scenario:
     from scenarios.scenario import load_scenario
+    from sitl.errors import UsageError
 
     scenario = load_scenario(args.scenario)
     changes: dict[str, Any] = {}
@@ -178,6 +179,8 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     if args.gains:
         changes["gain_sets"] = tuple(args.gains)
     if args.seed is not None:
+        if args.seed < 0:
+            raise UsageError(f"--seed {args.seed}: give 0 or more")
         changes["seed"] = args.seed
     return dataclasses.replace(scenario, **changes)
 
@@ -207,10 +210,6 @@ def _report(args: argparse.Namespace, result: RunResult) -> int:
     from scenarios.table import run_text, terminal_width
 
     run, folder = result.run, result.folder
-    if folder is not None:
-        from scenarios.junit import write_junit
-
-        write_junit(run, folder / "junit.xml")
     if args.junit is not None:
         from scenarios.junit import write_junit
 
@@ -257,6 +256,8 @@ def _sitl(args: argparse.Namespace) -> int:
     from sitl.vehicle_spec import DEFAULT_SCALING, resolve_vehicle
 
     clock = None
+    if args.seed < 0:
+        raise UsageError(f"--seed {args.seed}: give 0 or more")
     if args.speed != "max":
         try:
             clock = ScaledClock(float(args.speed))

@@ -93,11 +93,15 @@ def flight_page(flight: FlightRecord) -> str:
         rows = [[metric.name, _value(metric), metric.limit or "", str(metric.outcome)] for metric in limited]
         parts += ["## Limits", markdown_table(("metric", "value", "limit", "outcome"), rows, (0, 2, 3))]
     rest = [metric for metric in whole if metric.limit is None]
-    if rest:
-        rows = [[metric.name, _value(metric), metric.reason if metric.value is None else ""] for metric in rest]
-        parts += ["## Also measured", markdown_table(("metric", "value", ""), rows, (0, 2))]
+    measured = [[metric.name, _value(metric)] for metric in rest if metric.value is not None]
+    if measured:
+        parts += ["## Also measured", markdown_table(("metric", "value"), measured)]
+    missing = [f"{metric.name}: {metric.reason}" for metric in whole if metric.value is None]
+    if missing:
+        parts += ["## Not measured", _bullets(missing)]
     parts += ["## Gains", gains_table([flight])]
-    parts += [f"- {warning}" for warning in flight.warnings]
+    if flight.warnings:
+        parts += ["## Warnings", _bullets(flight.warnings)]
     return "\n\n".join(parts) + "\n"
 
 

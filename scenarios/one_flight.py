@@ -155,7 +155,7 @@ class _Flight:
             self._restore(client)
             if not self._job.in_memory:
                 for message_id in _INTERVALS_US:
-                    client.set_interval(message_id, 0)
+                    client.try_interval(message_id, 0)
         except (PeerLost, PeerSilent, CommandRefused, UploadFailed) as error:
             self._log.notes.append(f"teardown incomplete: {error}")
             if not self._log.failure:
@@ -208,7 +208,7 @@ class _Flight:
 
     def _set_streams(self, client: Client) -> None:
         for message_id, interval_us in _INTERVALS_US.items():
-            client.set_interval(message_id, interval_us)
+            client.try_interval(message_id, interval_us)
         if self._job.in_memory:
             for message_id in _UNUSED_STREAMS:
                 client.set_interval(message_id, -1)
@@ -278,7 +278,7 @@ class _Flight:
 
     def _write(self, record: FlightRecord) -> None:
         try:
-            if self._base is not None:
+            if self._base is not None and len(record.telemetry):
                 record.telemetry.to_parquet(
                     self._base.with_name(self._base.name + ".parquet"),
                     {"gain_set": record.gain_set.name, "vehicle": record.vehicle_spec},

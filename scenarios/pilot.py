@@ -195,7 +195,7 @@ class Pilot:
 
     def _sample_every(self, interval_us: int) -> None:
         for message_id in SAMPLED:
-            self._client.set_interval(message_id, interval_us)
+            self._client.try_interval(message_id, interval_us)
 
     def _gate(self, manoeuvre: Manoeuvre) -> None:
         gate = self._scenario.gate

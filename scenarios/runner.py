@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ from scenarios.one_flight import MEMORY, FlightJob, FlightStoppedError, fly
 from scenarios.run_folder import RunFolder, vehicle_description
 from scenarios.scenario import Scenario
 from sitl.airframe import FlightGains
-from sitl.errors import UsageError
+from sitl.errors import FroudeError, UsageError
 from sitl.parameters import ParameterTable, ParameterType
 from sitl.profile import Profile
 from sitl.vehicle import airframe_parameters
@@ -103,6 +104,13 @@ def run_scenario(
         for job in (*candidates, *([baseline] if baseline else []))
     ]
     flown, stopped = _fly_all(jobs, options.jobs, progress)
+    if stopped is not None:
+        flown = {index: record for index, record in flown.items() if len(record.telemetry)}
+        if not flown:
+            # nothing was flown, so there is nothing to keep: a folder of empty files would only be in the way
+            if folder is not None:
+                shutil.rmtree(folder.path, ignore_errors=True)
+            raise stopped
     own = flown.get(len(candidates)) if baseline else None
     run = RunRecord(
         scenario=scenario,
@@ -116,12 +124,22 @@ def run_scenario(
     )
     if folder is not None:
         progress(Progress(len(jobs), len(jobs), "run", "write"))
-        folder.write_run_json(run, options.command)
-        from scenarios.recorder.comparison import record_compare
-
-        record_compare(run, folder.compare)
-        folder.write_run_json(run, options.command)
+        try:
+            _write(run, folder, options)
+        except FroudeError as error:
+            # the flights themselves are on disk; the table is still worth printing
+            stopped = stopped or error
     return RunResult(run, folder.path if folder else None, stopped)
+
+
+def _write(run: RunRecord, folder: RunFolder, options: RunOptions) -> None:
+    """The run's own files; run.json first, so that it is there even if there is no room for the comparison."""
+    from scenarios.junit import write_junit
+    from scenarios.recorder.comparison import record_compare
+
+    folder.write_run_json(run, options.command)
+    write_junit(run, folder.path / "junit.xml")
+    record_compare(run, folder.compare)
 
 
 def plan(gain_set: GainSet, scenario: Scenario, model: VehicleModel, profile: Profile) -> FlightJob:

@@ -113,13 +113,14 @@ def notes(flight: FlightRecord) -> list[str]:
 
 
 def blank_cells(flights: Sequence[FlightRecord]) -> list[str]:
-    """Why cells are empty: one line per reason, naming the columns and the gain sets."""
+    """Why cells of flights that were flown are empty: one line per reason, naming columns and gain sets."""
     reasons: dict[tuple[str, tuple[str, ...]], list[str]] = {}
-    for flight in flights:
+    for flight in (flight for flight in flights if flight.segments):
         blanks: dict[str, list[str]] = {}
         for column in COLUMNS:
             metric = flight.metric(column.metrics[0])
-            if metric is not None and metric.value is None and metric.reason:
+            # What the verdict says already is not said twice.
+            if metric is not None and metric.value is None and metric.reason and metric.reason not in flight.reason:
                 blanks.setdefault(metric.reason, []).append(column.name)
         for reason, columns in blanks.items():
             reasons.setdefault((reason, tuple(columns)), []).append(flight.gain_set.name)
@@ -190,7 +191,14 @@ def _plain(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def run_text(run: RunRecord, folder: Path | None = None, *, width: int | None = None, colour: bool = False) -> str:
+def run_text(
+    run: RunRecord,
+    folder: Path | None = None,
+    *,
+    width: int | None = None,
+    colour: bool = False,
+    viewer: str = "",
+) -> str:
     """The whole result as text.
 
     Args:
@@ -199,6 +207,7 @@ def run_text(run: RunRecord, folder: Path | None = None, *, width: int | None = 
         width: columns to use; None for `PIPED_WIDTH`. Below `MINIMUM_WIDTH` the lines will be broken by the
             terminal.
         colour: with ANSI colours; meaningful only on a terminal.
+        viewer: how the Rerun viewer is called here; empty: `viewer_command()`.
 
     Returns:
         Lines, with a newline at the end.
@@ -238,7 +247,7 @@ def run_text(run: RunRecord, folder: Path | None = None, *, width: int | None = 
     if folder is not None:
         # Paths stand alone on their line and are never wrapped: they are there to be copied.
         tail.append(f"Run folder: {folder}")
-        tail.append(f"Look at it: rerun {shlex.quote(str(folder / 'compare.rrd'))}")
+        tail.append(f"Look at it: {viewer or viewer_command()} {shlex.quote(str(folder / 'compare.rrd'))}")
     if tail:
         console.print()
         for line in tail:
@@ -266,6 +275,18 @@ def _rich_table(flights: Sequence[FlightRecord]) -> Any:
         row += [Text(text, style=STYLES[outcome]) for text, outcome in cells(flight)]
         table.add_row(*row, Text(str(flight.outcome), style=f"bold {STYLES[flight.outcome]}".strip()))
     return table
+
+
+def viewer_command() -> str:
+    """How to call the Rerun viewer that matches this installation: `rerun`, or its path if that is not on PATH."""
+    import shutil
+    import sys
+
+    beside = Path(sys.executable).with_name("rerun")
+    if shutil.which("rerun") or not beside.is_file():
+        return "rerun"
+    here = Path.cwd()
+    return shlex.quote(str(beside.relative_to(here) if beside.is_relative_to(here) else beside))
 
 
 def terminal_width(stream: Any) -> tuple[int, bool]:

@@ -74,12 +74,15 @@ def effectiveness(rotors: Sequence[RotorEffect]) -> NDArray[np.float64]:
     matrix = np.zeros((6, len(rotors)))
     for i, rotor in enumerate(rotors):
         axis = np.asarray(rotor.axis, dtype=float)
+        if not np.isfinite([*rotor.position_m, *axis, rotor.ct, rotor.km]).all():
+            matrix[:, i] = math.nan
+            continue
         length = float(np.linalg.norm(axis))
         if length > 0.0:
             axis = axis / length
         matrix[:3, i] = rotor.ct * np.cross(rotor.position_m, axis) - rotor.ct * rotor.km * axis
         matrix[3:, i] = rotor.ct * axis
-    matrix[np.max(np.abs(matrix), axis=1) <= _WEAK_ROW] = 0.0
+    matrix[np.max(np.abs(matrix), axis=1, initial=0.0) <= _WEAK_ROW] = 0.0
     return matrix
 
 
@@ -90,12 +93,16 @@ def normalised_mix(rotors: Sequence[RotorEffect]) -> Mix:
     both; yaw is scaled by its largest entry, thrust by its mean.
 
     Args:
-        rotors: n rotors in motor order, 1 <= n <= 12.
+        rotors: n rotors in motor order, 0 <= n <= 12.
 
     Returns:
-        the mix and its pseudo-inverse.
+        the mix and its pseudo-inverse; that of no rotors if a number of the geometry is not finite (PX4 would send
+        NaN to every motor, which stops them).
     """
-    mix = np.linalg.pinv(effectiveness(rotors))
+    effect = effectiveness(rotors)
+    if not np.isfinite(effect).all():
+        return normalised_mix([])
+    mix = np.linalg.pinv(effect)
     n = len(rotors)
 
     def column_scale(column: NDArray[np.floating]) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 from sitl.compiled import compiled
+from sitl.filters import constrain
 from sitl.rotation import Quat, Vec3, canonical, conjugate, multiply, normalise, to_body, to_world
 
 _INVERTED = 1.0 - 1e-5
@@ -79,9 +80,9 @@ def attitude_control(
         q_sp += down[1] * yaw_rate_sp
         r_sp += down[2] * yaw_rate_sp
     return (
-        min(rate_max[0], max(-rate_max[0], p_sp)),
-        min(rate_max[1], max(-rate_max[1], q_sp)),
-        min(rate_max[2], max(-rate_max[2], r_sp)),
+        constrain(p_sp, -rate_max[0], rate_max[0]),
+        constrain(q_sp, -rate_max[1], rate_max[1]),
+        constrain(r_sp, -rate_max[2], rate_max[2]),
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl import control_loop
-from sitl.control_loop import CONTROL_INPUT, CONTROL_STATE, control_tick
+from sitl.control_loop import CONTROL_INPUT, CONTROL_SETTINGS, CONTROL_STATE, control_tick, settle_filters
 from sitl.control_settings import control_settings, mix_of, position_settings, position_ticks
 from sitl.failsafe import ACTION_MODE, Action, TiltDetector, offboard_loss_action
 from sitl.land_detector import LandDetector, LandLimits, Motion
@@ -87,6 +87,7 @@ class Autopilot:
         self._plant = plant
         self._sensors = sensors
         self._revision = -1
+        self._settings: NDArray[np.void] = np.zeros(1, CONTROL_SETTINGS)
         self._mix_key: tuple[object, ...] = ()
         self._input = np.zeros(1, CONTROL_INPUT)
         self._input["landed"] = True
@@ -118,6 +119,9 @@ class Autopilot:
         self._landed_us: int | None = None
         self._texts: list[Text] = []
         self._offboard_us: int | None = None
+        self._offboard_level = control_loop.OFF
+        self._takeoff_amsl_m: float | None = None
+        self._tilt_warned = False
         self._attitude_sp = AttitudeSetpoint()
         self._load()
 
@@ -180,15 +184,17 @@ class Autopilot:
             if not self.armed:
                 return Result.ACCEPTED
             if not self.land_detector.landed and not force:
-                return self._refuse("Disarming denied: not landed", Severity.CRITICAL)
+                return self._refuse("Disarming denied: not landed")
             self._disarm("Disarmed by external command")
             return Result.ACCEPTED
         if self.armed:
             return Result.ACCEPTED
-        problem = self._arming_problem()
+        health = self._health_problem()
+        if health:
+            self.say(Severity.CRITICAL, f"Preflight Fail: {health}")
+        problem = health or self._mode_problem()
         if problem:
-            self.say(Severity.CRITICAL, f"Preflight Fail: {problem}")
-            return self._refuse("Arming denied: Resolve system health failures first", Severity.CRITICAL)
+            return self._refuse("Arming denied: Resolve system health failures first", problem)
         self.armed = True
         self._armed_us = self._now_us
         self._took_off = False
@@ -202,23 +208,21 @@ class Autopilot:
     def command_mode(self, mode: Mode) -> Result:
         """Switch the mode; disarmed every flown mode is accepted, armed only one that can run."""
         if self.terminated:
-            return self._refuse("Switching modes denied: flight terminated", Severity.CRITICAL)
+            return self._refuse("Switching modes denied: flight terminated")
         if mode not in AVAILABLE:
             flown = ", ".join(MODE_NAMES[m] for m in AVAILABLE)
             return self._refuse(f"Mode {MODE_NAMES[mode]} is not flown by this vehicle (flown: {flown})")
         if self.armed and mode is Mode.OFFBOARD and not self._offboard_fresh():
-            self.say(Severity.CRITICAL, "Switching to mode 'Offboard' is currently not possible")
-            return self._refuse("No offboard signal")
-        if mode is Mode.TAKEOFF:
-            self._aim_takeoff(None)
+            return self._refuse("Switching to Offboard is currently not available", "no offboard signal")
+        self._takeoff_amsl_m = None
         self._switch(mode)
         return Result.ACCEPTED
 
     def command_takeoff(self, altitude_amsl_m: float | None) -> Result:
-        """Take off to a height, m AMSL, or to MIS_TAKEOFF_ALT above home; flies once armed."""
+        """Take off to a height, m AMSL, or to MIS_TAKEOFF_ALT above here; flies once armed."""
         if self.terminated:
-            return self._refuse("Takeoff denied: flight terminated", Severity.CRITICAL)
-        self._aim_takeoff(altitude_amsl_m)
+            return self._refuse("Takeoff denied: flight terminated")
+        self._takeoff_amsl_m = altitude_amsl_m
         self._switch(Mode.TAKEOFF)
         return Result.ACCEPTED
 
@@ -252,7 +256,7 @@ class Autopilot:
     def offboard_attitude(
         self, quat: tuple[float, float, float, float] | None, rates: tuple[float, float, float], thrust: float
     ) -> None:
-        """A SET_ATTITUDE_TARGET: keeps Offboard alive and, in Offboard, is flown.
+        """A SET_ATTITUDE_TARGET: keeps Offboard alive and, in Offboard, is flown as soon as the vehicle is armed.
 
         Args:
             quat: attitude set-point, or None for rates alone.
@@ -265,14 +269,13 @@ class Autopilot:
         count = self._attitude_sp.count + 1
         shown = quat if quat is not None else (1.0, 0.0, 0.0, 0.0)
         self._attitude_sp = AttitudeSetpoint(self._now_us, shown, rates, abs(thrust), count)
-        self._input["thrust_sp"] = abs(thrust)
-        if quat is None:
-            self._input["level"] = control_loop.RATES
-            self._input["rates_sp"] = rates
-        else:
-            self._input["level"] = control_loop.ATTITUDE
-            self._quat_sp[:] = quat
-            self._input["yaw_rate_sp"] = rates[2]
+        self._offboard_level = control_loop.RATES if quat is None else control_loop.ATTITUDE
+        self._input["rates_sp"] = rates
+        self._input["yaw_rate_sp"] = rates[2]
+        self._quat_sp[:] = shown
+        if self.armed:
+            self._input["thrust_sp"] = abs(thrust)
+            self._input["level"] = self._offboard_level
 
     def _offboard_fresh(self) -> bool:
         if self._offboard_us is None:
@@ -307,7 +310,7 @@ class Autopilot:
         table = self.parameters
         self._revision = table.revision
         self._mix = mix_of(table)
-        self._settings = control_settings(table, self._profile, self._mix)
+        self._take_control_settings(control_settings(table, self._profile, self._mix))
         self._position_settings = position_settings(table, self._profile)
         get = table.get
         self._tilt_max_air = math.radians(float(get("MPC_TILTMAX_AIR")))
@@ -321,14 +324,22 @@ class Autopilot:
             rot_max=math.radians(float(get("LNDMC_ROT_MAX"))),
         )
 
+    def _take_control_settings(self, new: NDArray[np.void]) -> None:
+        before, self._settings = self._settings, new
+        changed = any((new[name] != before[name]).any() for name in ("low_pass", "notches", "notch_count"))
+        if changed and self.state["started"][0]:
+            settle_filters(new, self.state)
+
     def _hold_position(self) -> None:
         position = self._plant.position_ned()
         home_down = self.home.position_ned[2] if self.home else 0.0
         dt_s = float(self._position_settings["dt_s"][0])
-        contact = self.land_detector.ground_contact
+        detector = self.land_detector
         flying = self.navigator.state is TakeoffState.FLIGHT
         self._position_settings["tilt_max"] = self._tilt_max_air if flying else self._tilt_max_ground
-        self.navigator.update(self._now_us, dt_s, self.mode, position, contact, home_down)
+        self.navigator.update(
+            self._now_us, dt_s, self.mode, position, detector.ground_contact, detector.landed, home_down
+        )
         position_tick(
             self._position_settings,
             self.navigator.request,
@@ -363,11 +374,14 @@ class Autopilot:
         input_ = self._input
         self.land_detector.update(now, self._motion(), self._land_limits, self.armed)
         input_["landed"] = self.land_detector.maybe_landed
-        if not self.armed:
-            return
         self._tilt.update(now, phi, theta, int(input_["level"][0]) != control_loop.OFF)
         if self._tilt.failed and not self.terminated:
             self._on_tilt()
+        elif self._tilt_warned:
+            self._tilt_warned = False
+            self.failsafe = self.terminated or self.mode is not self._intended
+        if not self.armed:
+            return
         self._watch_offboard()
         self._watch_landing()
         flying = self.mode is Mode.TAKEOFF and self.navigator.state is TakeoffState.FLIGHT
@@ -394,8 +408,8 @@ class Autopilot:
         elif action is Action.TERMINATE:
             self.say(Severity.EMERGENCY, "Attitude failure detected: flight terminated")
             self._terminate()
-        elif not self.failsafe:
-            self.failsafe = True
+        elif not self._tilt_warned:
+            self._tilt_warned = self.failsafe = True
             self.say(Severity.CRITICAL, "Attitude failure detected")
 
     def _watch_offboard(self) -> None:
@@ -405,17 +419,15 @@ class Autopilot:
         if self.mode is Mode.OFFBOARD and not fresh:
             self.failsafe = True
             action = offboard_loss_action(self.parameters)
-            self.say(Severity.CRITICAL, f"Failsafe activated: offboard signal lost, {action.name.lower()}")
+            self.say(Severity.CRITICAL, "Failsafe activated")
             if action is Action.DISARM:
                 self._disarm("Disarmed by failsafe")
             elif action is Action.TERMINATE:
                 self._terminate()
             else:
-                self.navigator.airborne()
                 self._enter(ACTION_MODE[action])
-        elif self.mode is not Mode.OFFBOARD and fresh and self.failsafe:
-            self.failsafe = False
-            self.say(Severity.INFO, "Failsafe cleared: offboard signal regained")
+        elif self.mode is not Mode.OFFBOARD and fresh:
+            self.failsafe = self._tilt_warned
             self._enter(Mode.OFFBOARD)
 
     def _watch_landing(self) -> None:

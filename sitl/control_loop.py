@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sitl.actuators import MAX_MOTORS, allocate, motor_output, saturation
 from sitl.attitude_control import attitude_control, linear_attitude_control
 from sitl.compiled import Record, compiled
-from sitl.filters import biquad, settle_biquad
+from sitl.filters import biquad, constrain, settle_biquad
 from sitl.rate_control import rate_control
 from sitl.rotation import normalise, to_euler
 
@@ -114,6 +114,22 @@ def _filter_gyro(settings: Record, state: Record, gyro: NDArray[np.float64]) -> 
 
 
 @compiled
+def settle_filters(settings_array: NDArray[np.void], state_array: NDArray[np.void]) -> None:
+    """Let changed gyro filters start from the rates they put out last, as PX4 does when a cutoff is set in flight.
+
+    Args:
+        settings_array: (1,) of CONTROL_SETTINGS, the new ones. state_array: (1,) of CONTROL_STATE, updated in place.
+    """
+    settings: Record = settings_array[0]
+    state: Record = state_array[0]
+    for axis in range(3):
+        rate = state.rates[axis]
+        for i in range(settings.notch_count):
+            settle_biquad(settings.notches[i], state.notches[i, axis], rate)
+        settle_biquad(settings.low_pass, state.low_pass[axis], rate)
+
+
+@compiled
 def _estimate_attitude(settings: Record, state: Record, quat: NDArray[np.float64]) -> None:
     if state.started:
         for i in range(HISTORY - 1, 0, -1):
@@ -141,18 +157,16 @@ def _estimate_attitude(settings: Record, state: Record, quat: NDArray[np.float64
 
 @compiled
 def _attitude_law(settings: Record, request: Record, state: Record) -> None:
-    if request.level == RATES:
-        for axis in range(3):
-            state.rates_sp[axis] = request.rates_sp[axis]
-        return
     if request.level != ATTITUDE:
+        for axis in range(3):
+            state.rates_sp[axis] = request.rates_sp[axis] if request.level == RATES else 0.0
         return
     a = state.attitude
     quat = (a[0], a[1], a[2], a[3])
     s = request.quat_sp
     quat_sp = (s[0], s[1], s[2], s[3])
     gain = (settings.att_gain[0], settings.att_gain[1], settings.att_gain[2])
-    if not s[0] ** 2 + s[1] ** 2 + s[2] ** 2 + s[3] ** 2 > 0.0:
+    if not 0.0 < s[0] ** 2 + s[1] ** 2 + s[2] ** 2 + s[3] ** 2 < math.inf:
         wanted = (math.nan, math.nan, math.nan)
     elif settings.linear:
         wanted = linear_attitude_control(to_euler(quat), to_euler(normalise(quat_sp)), gain)
@@ -192,8 +206,11 @@ def _rate_law(settings: Record, request: Record, state: Record) -> None:
 @compiled
 def _allocation(settings: Record, request: Record, state: Record) -> None:
     n = settings.motor_count
+    for i in range(n, MAX_MOTORS):
+        state.motors[i] = 0.0
+        state.outputs[i] = 0.0
     if request.level == OFF:
-        for i in range(MAX_MOTORS):
+        for i in range(n):
             state.motors[i] = 0.0
             state.outputs[i] = 0.0
         for axis in range(3):
@@ -203,14 +220,16 @@ def _allocation(settings: Record, request: Record, state: Record) -> None:
     if not settings.limits:
         allocate(settings.mix, n, state.torque_sp, request.thrust_sp, 0, 0, state.motors)
         for i in range(n):
-            state.outputs[i] = state.motors[i]
+            state.outputs[i] = state.motors[i] if math.isfinite(state.motors[i]) else 0.0
         return
     wanted = np.empty(MAX_MOTORS)
     allocate(settings.mix, n, state.torque_sp, request.thrust_sp, settings.method, settings.airmode, wanted)
     for i in range(n):
         slew = settings.slew_per_tick[i]
-        value = min(state.motors[i] + slew, max(state.motors[i] - slew, wanted[i]))
-        state.motors[i] = min(1.0, max(0.0, value))
+        # PX4 stops a motor whose command is not a number
+        value = wanted[i] if math.isfinite(wanted[i]) else 0.0
+        value = constrain(value, state.motors[i] - slew, state.motors[i] + slew)
+        state.motors[i] = constrain(value, 0.0, 1.0)
         state.outputs[i] = motor_output(state.motors[i], settings.thr_mdl_fac)
     state.status_age += 1
     if state.status_age >= settings.status_ticks:
@@ -241,9 +260,11 @@ def control_tick(
     _filter_gyro(settings, state, gyro)
     _estimate_attitude(settings, state, quat)
     state.started = True
-    if not settings.rate_sp_late:
+    # what is late is the attitude law's answer: a rate set-point that was asked for is flown at once
+    late: bool = settings.rate_sp_late and request.level == ATTITUDE
+    if not late:
         _attitude_law(settings, request, state)
     _rate_law(settings, request, state)
     _allocation(settings, request, state)
-    if settings.rate_sp_late:
+    if late:
         _attitude_law(settings, request, state)

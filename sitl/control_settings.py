@@ -16,6 +16,8 @@ from sitl.profile import Profile
 
 _AXES = (("ROLL", "RR"), ("PITCH", "PR"), ("YAW", "YR"))
 _STATUS_PERIOD_S = 0.005
+_LARGEST = 3.4e38
+"""Stands for a limit that someone set to infinity: infinity means the study's loop, which has no limits at all."""
 
 
 def mix_of(parameters: ParameterTable) -> Mix:
@@ -72,7 +74,7 @@ def control_settings(parameters: ParameterTable, profile: Profile, mix: Mix) -> 
         settings["rate_max"][0, i] = limit if profile.limits else math.inf
         for field, suffix in (("k", "K"), ("kp", "P"), ("ki", "I"), ("kd", "D"), ("kff", "FF")):
             settings[field][0, i] = get(f"MC_{axis}RATE_{suffix}")
-        settings["int_lim"][0, i] = get(f"MC_{short}_INT_LIM") if profile.limits else math.inf
+        settings["int_lim"][0, i] = min(get(f"MC_{short}_INT_LIM"), _LARGEST) if profile.limits else math.inf
     settings["yaw_torque_alpha"] = alpha_of(get("MC_YAW_TQ_CUTOFF"), dt_s)
     settings["mix"][0, : mix.motors] = mix.columns
     settings["inverse"][0, :, : mix.motors] = mix.inverse

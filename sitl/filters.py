@@ -65,6 +65,16 @@ def alpha_of(cutoff_hz: float, dt_s: float) -> float:
 
 
 @compiled
+def constrain(value: float, low: float, high: float) -> float:
+    """PX4's ``constrain``: a value held between two limits. A NaN value stays NaN, a NaN limit does not limit."""
+    if value < low:
+        return low
+    if value > high:
+        return high
+    return value
+
+
+@compiled
 def biquad(coefficients: NDArray[np.float64], delay: NDArray[np.float64], sample: float) -> float:
     """Next output of a biquad in direct form II.
 

@@ -15,6 +15,8 @@ STAGE_US = 333_000
 _FREEFALL_M_S2 = 2.0
 _LOW_THROTTLE = 0.6
 """Share of the way from minimum to hover thrust that still counts as low (hover thrust known)."""
+_NO_THROTTLE = 0.1
+"""Share of the same way that counts as none while the mode controls vertical speed."""
 
 
 class Motion(NamedTuple):
@@ -73,21 +75,22 @@ class LandDetector:
             self.ground_contact = self.maybe_landed = self.landed = True
             self._contact_since = self._maybe_since = self._landed_since = now_us - STAGE_US
             return
-        low = limits.thr_min + _LOW_THROTTLE * (limits.hover_thrust - limits.thr_min)
+        span = limits.hover_thrust - limits.thr_min
+        low = limits.thr_min + _LOW_THROTTLE * span
         vn, ve, vd = motion.velocity_ned
         touching = (
             motion.thrust <= low
             and abs(vd) < limits.z_vel_max
             and math.hypot(vn, ve) < limits.xy_vel_max
-            and (motion.descending or not motion.climb_controlled)
+            and (motion.descending or not motion.climb_controlled or self.maybe_landed)
         )
-        floor = limits.thr_min if motion.climb_controlled else limits.manual_min
+        floor = limits.thr_min + _NO_THROTTLE * span if motion.climb_controlled else limits.manual_min + 0.01
         factor = 2.5 if self.landed else 1.0
         still = math.hypot(motion.rates[0], motion.rates[1]) < limits.rot_max * factor
         falling = math.sqrt(sum(f * f for f in motion.specific_force)) < _FREEFALL_M_S2
         self._contact_since = (self._contact_since or now_us) if touching else None
         self.ground_contact = touching and now_us - (self._contact_since or now_us) >= STAGE_US
-        maybe = self.ground_contact and motion.thrust <= floor + 0.01 and still and not falling
+        maybe = self.ground_contact and motion.thrust <= floor and still and not falling
         self._maybe_since = (self._maybe_since or now_us) if maybe else None
         self.maybe_landed = maybe and now_us - (self._maybe_since or now_us) >= STAGE_US
         self._landed_since = (self._landed_since or now_us) if self.maybe_landed else None

@@ -11,6 +11,7 @@ from enum import Enum
 
 import numpy as np
 
+from sitl.filters import constrain
 from sitl.modes import Mode
 from sitl.parameters import ParameterTable
 from sitl.position_control import POSITION_INPUT
@@ -75,12 +76,8 @@ class Navigator:
             position: NED, m. velocity: NED, m/s. yaw: rad.
         """
         brake = 2.0 * self._get("MPC_ACC_HOR")
-        speed = math.hypot(velocity[0], velocity[1])
-        self.hold_ned = [
-            position[0] + velocity[0] * speed / brake,
-            position[1] + velocity[1] * speed / brake,
-            position[2],
-        ]
+        reach = math.hypot(velocity[0], velocity[1]) / brake if brake > 0.0 else 0.0
+        self.hold_ned = [position[0] + velocity[0] * reach, position[1] + velocity[1] * reach, position[2]]
         self.yaw = yaw
         self._climb = velocity[2]
         self.descending = False
@@ -89,9 +86,7 @@ class Navigator:
         """Is the take-off height reached? down: m."""
         return self.target_down is not None and abs(down - self.target_down) < 0.3 and abs(self._climb) < 0.5
 
-    def _speed_towards(self, error: float, up_max: float, down_max: float, dt_s: float) -> float:
-        gain = self._get("MPC_Z_P")
-        wanted = min(down_max, max(-up_max, gain * error))
+    def _speed_up_to(self, wanted: float, dt_s: float) -> float:
         rise = self._get("MPC_ACC_UP_MAX") * dt_s
         fall = self._get("MPC_ACC_DOWN_MAX") * dt_s
         self._climb = min(self._climb + fall, max(self._climb - rise, wanted))
@@ -110,6 +105,7 @@ class Navigator:
         mode: Mode,
         position: tuple[float, float, float],
         ground_contact: bool,
+        landed: bool,
         home_down: float,
     ) -> None:
         """Set-points for the next run of the position controller.
@@ -118,7 +114,7 @@ class Navigator:
             now_us: vehicle time. dt_s: time since the last run.
             mode: one of POSITION_MODES.
             position: NED, m.
-            ground_contact: from the land detector.
+            ground_contact: from the land detector. landed: likewise.
             home_down: height of home in the local frame, m (down).
         """
         request = self.request
@@ -128,9 +124,12 @@ class Navigator:
         request["velocity_sp"][0] = 0.0
         if self.state is TakeoffState.SPOOLUP and now_us - self._armed_us >= self._get("COM_SPOOLUP_TIME") * 1e6:
             self.state = TakeoffState.READY
+        if self.state is TakeoffState.FLIGHT and landed:
+            self.state = TakeoffState.READY
         self.descending = mode in (Mode.LAND, Mode.DESCEND)
-        if self.state is TakeoffState.READY and mode is Mode.TAKEOFF:
+        if self.state is TakeoffState.READY and mode is Mode.TAKEOFF and self._is_above(position[2]):
             self.state = TakeoffState.RAMPUP
+            self._ramp = 0.0
             self._climb = 0.0
         if self.state in (TakeoffState.DISARMED, TakeoffState.SPOOLUP, TakeoffState.READY):
             request["idle"] = True
@@ -140,21 +139,24 @@ class Navigator:
         request["idle"] = ground_contact and self.state is TakeoffState.FLIGHT and self.descending
         if self.descending:
             request["position_sp"][0, 2] = math.nan
-            request["velocity_sp"][0, 2] = self._speed_towards(
-                math.inf, 0.0, self._landing_speed(home_down - position[2]), dt_s
-            )
+            request["velocity_sp"][0, 2] = self._speed_up_to(self._landing_speed(home_down - position[2]), dt_s)
             if mode is Mode.DESCEND:
                 request["position_sp"][0, :2] = math.nan
             return
         if mode is Mode.TAKEOFF and self.target_down is not None:
-            up = self._get("MPC_TKO_SPEED")
-            climb = self._speed_towards(self.target_down - position[2], up, self._get("MPC_Z_V_AUTO_DN"), dt_s)
+            towards = self._get("MPC_Z_P") * (self.target_down - position[2])
+            towards = constrain(towards, -self._get("MPC_TKO_SPEED"), self._get("MPC_Z_V_AUTO_DN"))
+            climb = self._speed_up_to(towards, dt_s)
             if self.state is TakeoffState.RAMPUP:
                 climb = self._ramped(climb, dt_s)
             request["position_sp"][0, 2] = math.nan
             request["velocity_sp"][0, 2] = climb
             return
         request["position_sp"][0, 2] = self.hold_ned[2]
+
+    def _is_above(self, down: float) -> bool:
+        """Is there any way up to the take-off height? down: where the vehicle is, m."""
+        return self.target_down is not None and self.target_down < down - 0.01
 
     def _ramped(self, climb: float, dt_s: float) -> float:
         """PX4's thrust ramp: from the speed set-point that means no thrust to the wanted one."""
@@ -163,7 +165,7 @@ class Navigator:
         if self._ramp >= 1.0:
             self.state = TakeoffState.FLIGHT
             return climb
-        start = _G / self._get("MPC_Z_VEL_P_ACC")
+        start = _G / max(0.01, self._get("MPC_Z_VEL_P_ACC"))
         ramped = start + self._ramp * (climb - start)
         self.descending = ramped > 0.0
         return ramped

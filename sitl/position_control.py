@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl.compiled import Record, compiled
+from sitl.filters import constrain
 
 PERIOD_S = 0.008
 
@@ -70,6 +71,8 @@ def _attitude_from_thrust(thrust: NDArray[np.float64], yaw: float, quat: NDArray
     xx, xy, xz = cy * zz, -cx * zz, cx * zy - cy * zx
     if zz < 0.0:
         xx, xy, xz = -xx, -xy, -xz
+    if abs(zz) < 1e-6:
+        xx, xy, xz = 0.0, 0.0, 1.0  # thrust lies flat: heading has no meaning
     norm = math.sqrt(xx * xx + xy * xy + xz * xz)
     xx, xy, xz = xx / norm, xy / norm, xz / norm
     yx, yy, yz = zy * xz - zz * xy, zz * xx - zx * xz, zx * xy - zy * xx
@@ -87,11 +90,6 @@ def _attitude_from_thrust(thrust: NDArray[np.float64], yaw: float, quat: NDArray
         s = math.sqrt(1.0 + zz - xx - yy) * 2.0
         w, a, b, c = (xy - yx) / s, (zx + xz) / s, (zy + yz) / s, 0.25 * s
     quat[0], quat[1], quat[2], quat[3] = w, a, b, c
-
-
-@compiled
-def _limit(a: float, low: float, high: float) -> float:
-    return min(high, max(low, a))
 
 
 @compiled
@@ -144,9 +142,9 @@ def position_tick(
         state.vel_sp[1] *= s.vel_xy_max / speed
     if math.isfinite(request.position_sp[2]):
         # a speed asked for by itself may pass the limit: the take-off ramp starts from one that means no thrust
-        state.vel_sp[2] = _limit(state.vel_sp[2], -s.vel_up_max, s.vel_down_max)
+        state.vel_sp[2] = constrain(state.vel_sp[2], -s.vel_up_max, s.vel_down_max)
     error = np.empty(3)
-    state.vel_int[2] = _limit(state.vel_int[2], -_G, _G)
+    state.vel_int[2] = constrain(state.vel_int[2], -_G, _G)
     for i in range(3):
         error[i] = state.vel_sp[i] - velocity[i]
         state.acc_sp[i] = s.vel_p[i] * error[i] + state.vel_int[i] - s.vel_d[i] * state.vel_dot[i]
@@ -167,11 +165,13 @@ def position_tick(
     if side > side_max:
         tx, ty = tx / side * side_max, ty / side * side_max
     got_x, got_y = tx * _G / s.hover_thrust, ty * _G / s.hover_thrust
-    if state.acc_sp[0] ** 2 + state.acc_sp[1] ** 2 > got_x**2 + got_y**2:
+    if s.vel_p[0] > 0.0 and state.acc_sp[0] ** 2 + state.acc_sp[1] ** 2 > got_x**2 + got_y**2:
         error[0] -= 2.0 / s.vel_p[0] * (state.acc_sp[0] - got_x)
         error[1] -= 2.0 / s.vel_p[1] * (state.acc_sp[1] - got_y)
     for i in range(3):
-        state.vel_int[i] += error[i] * s.vel_i[i] * s.dt_s
+        moved = state.vel_int[i] + error[i] * s.vel_i[i] * s.dt_s
+        if math.isfinite(moved):
+            state.vel_int[i] = moved
     thrust = np.array([tx, ty, tz])
     _attitude_from_thrust(thrust, request.yaw_sp, state.quat_sp)
     state.thrust_sp = math.sqrt(tx * tx + ty * ty + tz * tz)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from sitl.compiled import compiled
+from sitl.filters import constrain
 
 _I_FACTOR_RATE = math.radians(400.0)
 """Rate error at which the integrator stops altogether, rad/s."""
@@ -38,7 +39,7 @@ def rate_control(
         accel: filtered derivative of the rate, rad/s^2.
         integral: integrator state, normalised torque.
         k: MC_xRATE_K. kp: MC_xRATE_P. ki: MC_xRATE_I. kd: MC_xRATE_D. kff: MC_xRATE_FF.
-        int_lim: MC_xR_INT_LIM, normalised torque; infinity for none.
+        int_lim: MC_xR_INT_LIM, normalised torque; infinity for none, and then for no 400 deg/s fade-out either.
         positive_saturated: no more positive torque to be had. negative_saturated: nor negative.
         frozen: landed or maybe landed.
         dt_s: time since the last sample, s.
@@ -56,10 +57,10 @@ def rate_control(
         if negative_saturated:
             error = max(error, 0.0)
         ratio = error / _I_FACTOR_RATE
-        factor = max(0.0, 1.0 - ratio * ratio) if math.isfinite(int_lim) else 1.0
+        factor = max(0.0, 1.0 - ratio * ratio) if int_lim != math.inf else 1.0
         moved = integral + factor * k * ki * error * dt_s
         if math.isfinite(moved):
-            integral = min(int_lim, max(-int_lim, moved))
+            integral = constrain(moved, -int_lim, int_lim)
     if not math.isfinite(torque):
         torque = 0.0
     return torque, integral

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from sitl.autopilot import Autopilot
@@ -202,6 +201,5 @@ def airframe_parameters(model: VehicleModel, profile: Profile) -> dict[str, floa
     }
     for i, rotor in enumerate(rotors):
         for what, value in (("PX", rotor.px_m), ("PY", rotor.py_m), ("PZ", rotor.pz_m), ("KM", rotor.km)):
-            if value != 0.0 and math.isfinite(value):
-                values[f"CA_ROTOR{i}_{what}"] = value
+            values[f"CA_ROTOR{i}_{what}"] = value
     return values

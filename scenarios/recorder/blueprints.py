@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scenarios.recorder.body import PLACE
 from scenarios.recorder.stream import TIMELINE, Colour
 
-BEFORE_S, AFTER_S = 1.0, 0.5
-"""Time shown before and after a manoeuvre."""
+BEFORE_S = 1.0
+"""Time shown before a manoeuvre; none after it, where another flight mode has other set-points."""
 
 # Okabe and Ito's palette without black: eight hues that stay apart for colour-blind eyes, on dark and light
 # ground.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from scenarios.limits import LIMIT_CYCLE_RAD_S, Outcome
 from scenarios.recorder import blueprints
-from scenarios.recorder.blueprints import AFTER_S, BEFORE_S, LIMIT, RANKS, SETPOINT, Page, candidate_colour
+from scenarios.recorder.blueprints import BEFORE_S, LIMIT, RANKS, SETPOINT, Page, candidate_colour
 from scenarios.recorder.flight_recorder import DEG
 from scenarios.recorder.stream import Recording
 
@@ -141,7 +141,7 @@ def _parts(flights: Sequence[FlightRecord], manoeuvre: str) -> list[_Part]:
         if not segments:
             continue
         start = segments[0].start_s
-        rows = flight.telemetry.between(start - BEFORE_S, segments[-1].end_s + AFTER_S)
+        rows = flight.telemetry.between(start - BEFORE_S, segments[-1].end_s)
         if not len(rows):
             continue
         names = ("phi_sp_rad", "phi_rad", "p_rad_s", "delta_lat")
@@ -155,7 +155,7 @@ def _write_manoeuvre(recording: Recording, prefix: str, manoeuvre: str, parts: S
     """Every flight's part of one manoeuvre; returns its page."""
     # A flight that was broken off shows only the beginning of the set-point.
     longest = max(parts, key=lambda part: part.duration_s)
-    tracking = all(segment.kind == "track" for segment in longest.segments)
+    tracking = any(segment.kind == "track" for segment in longest.segments)
     _write_setpoint(recording, prefix, longest)
     for place, part in enumerate(parts, start=1):
         best = ", best" if part.rank == "best" else ""
@@ -174,7 +174,7 @@ def _write_manoeuvre(recording: Recording, prefix: str, manoeuvre: str, parts: S
     return Page(
         manoeuvre,
         -BEFORE_S,
-        longest.duration_s + AFTER_S,
+        longest.duration_s,
         roll_deg=blueprints.roll_range_deg(
             longest.phi_sp_deg, np.concatenate([part.phi_deg for part in parts]), spans=0.5
         ),

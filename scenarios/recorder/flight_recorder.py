@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenarios.recorder import blueprints
-from scenarios.recorder.blueprints import AFTER_S, BEFORE_S, LIMIT, MEASURED, PALETTE, SETPOINT, Page
+from scenarios.recorder.blueprints import BEFORE_S, LIMIT, MEASURED, PALETTE, SETPOINT, Page
 from scenarios.recorder.body import BodyView, RotorPlace
 from scenarios.recorder.stream import Colour, Recording
 
@@ -252,7 +252,7 @@ class FlightRecorder:
                 Page(
                     manoeuvre,
                     start - BEFORE_S,
-                    end + AFTER_S,
+                    end,
                     roll_deg=blueprints.roll_range_deg(within[:, 1], within[:, 2], spans=2.0),
                     # A gentle set uses a fraction of what there is; its limits would leave a flat line to
                     # look at.

@@ -118,7 +118,7 @@ def test_parameters(console: Callable[..., Console]) -> None:
 
 
 def fetched(mavproxy: Console, name: str, value: str) -> bool:
-    """Ask the vehicle for a parameter until it has the value: MAVProxy sets it some time after it was told to."""
+    """Ask the vehicle for a parameter until it has the value: MAVProxy sets it in its own time."""
     for _ in range(20):
         mavproxy.say(f"param fetch {name}")
         if mavproxy.until(rf"{name} = (\S+)")[1].startswith(value):

@@ -18,6 +18,7 @@ from scenarios.table import (
     own_gains_line,
     run_text,
     terminal_width,
+    viewer_command,
 )
 
 FOLDER = Path("logs/20261122T200000Z_demo_ant-x")
@@ -62,7 +63,7 @@ def test_reasons_warnings_and_blanks_stand_below(flown_run):
     text = run_text(flown_run, FOLDER, width=160)
     assert "7.2 cycles: limit cycle on roll: 2.1 rad/s at 9.0 Hz" in text
     assert "warning: MC_ROLLRATE_I 35.8 exceeds PX4's maximum 10" in text
-    assert "– overshoot, rise (7.2 cycles): limit cycle" in text
+    assert "– overshoot" not in text  # its reason is the verdict's
     assert "– settle 2 % (own gains): never inside the band" in text
     assert "arming refused" in text
 
@@ -74,15 +75,31 @@ def test_the_assumptions_in_force_are_said_once(flown_run):
 
 
 def test_it_says_where_the_run_is_and_how_to_look_at_it(flown_run):
-    lines = run_text(flown_run, FOLDER).splitlines()
+    lines = run_text(flown_run, FOLDER, viewer="rerun").splitlines()
     assert f"Run folder: {FOLDER}" in lines
     assert f"Look at it: rerun {FOLDER}/compare.rrd" in lines
     assert "rerun" not in run_text(flown_run, None)
 
 
+def test_the_viewer_is_called_so_that_it_is_found(monkeypatch, tmp_path):
+    monkeypatch.setattr("shutil.which", lambda _: "/usr/bin/rerun")
+    assert viewer_command() == "rerun"
+    monkeypatch.setattr("shutil.which", lambda _: None)
+    monkeypatch.setattr("sys.executable", str(tmp_path / "bin" / "python"))
+    assert viewer_command() == "rerun"  # not beside us either: nothing better to say
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "rerun").write_text("")
+    assert viewer_command() == str(tmp_path / "bin" / "rerun")
+    monkeypatch.chdir(tmp_path)
+    assert viewer_command() == "bin/rerun"
+
+
 def test_long_paths_are_never_wrapped_and_are_quoted(flown_run):
     folder = Path("/tmp/" + "long folder " * 20)
-    assert f"Look at it: rerun '{folder}/compare.rrd'" in run_text(flown_run, folder, width=80).splitlines()
+    assert (
+        f"Look at it: rerun '{folder}/compare.rrd'"
+        in run_text(flown_run, folder, width=80, viewer="rerun").splitlines()
+    )
 
 
 def test_colour_only_when_asked(flown_run):
@@ -147,8 +164,8 @@ def test_own_gains_that_are_only_slow_do_fly(flown_run):
 
 
 def test_blank_cells_are_grouped_by_reason(flown_run):
-    twice = (flown_run.flights[1], dataclasses.replace(flown_run.flights[1]))
-    assert blank_cells(twice) == ["– overshoot, rise (7.2 cycles, 7.2 cycles): limit cycle"]
+    flight = dataclasses.replace(flown_run.flights[1], reason="")
+    assert blank_cells((flight, flight)) == ["– overshoot, rise (7.2 cycles, 7.2 cycles): limit cycle"]
 
 
 def test_markdown_tables_have_one_cell_per_column_whatever_is_in_them():
