@@ -118,14 +118,18 @@ class FrameSplitter:
 
     def feed(self, data: bytes) -> list[Message]:
         """Return the good frames that these bytes complete, in order; never raises."""
-        if not self._rest and len(data) > HEADER_2 and data[0] == MAGIC_2 and len(data) == data[1] + HEADER_2 + 2:
-            # Nearly every datagram: one whole frame and nothing else.
-            message = self._read(data, 0)
-            if message.__class__ is Message and not self._adrift:
-                counters = self._counters
-                counters.received += 1
-                counters.heard(message.sysid, message.compid, message.seq)
-                return [message]
+        if not self._rest and not self._adrift and len(data) > HEADER_2 and data[0] == MAGIC_2 and not data[2]:
+            # Nearly every datagram: one whole, unsigned frame and nothing else.
+            kind = self._types.get(data[7] | data[8] << 8 | data[9] << 16)
+            stop = HEADER_2 + data[1]
+            if (
+                kind is not None
+                and len(data) == stop + 2
+                and crc16(data[1:stop] + kind.crc_extra) == data[stop] | data[stop + 1] << 8
+            ):
+                self._counters.received += 1
+                self._counters.heard(data[5], data[6], data[4])
+                return [Message(kind, data, HEADER_2, stop, data[4], data[5], data[6], False)]
         return self._split(self._rest + data if self._rest else data, final=self._datagram)
 
     def flush(self) -> list[Message]:

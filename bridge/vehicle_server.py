@@ -149,11 +149,15 @@ class VehicleServer:
         """
         self.listen()
         self.vehicle.step()
-        self.tick()
+        self.speak()
 
     def tick(self) -> None:
         """Read every link, answer, send what is due."""
         self.listen()
+        self.speak()
+
+    def speak(self) -> None:
+        """Send the telemetry, texts and parameters that are due on every link."""
         now_us = self.vehicle.time_us
         for link in self.links:
             if now_us >= link.resting_until_us:

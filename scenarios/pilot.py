@@ -93,8 +93,8 @@ class Pilot:
                 self._progress(manoeuvre.name)
                 self._stop()
                 self._into_offboard()
-                self._sample_every(FAST_INTERVAL_US)
                 self._gate(manoeuvre)
+                self._sample_every(FAST_INTERVAL_US)
                 self._manoeuvre(manoeuvre)
                 self._sample_every(CRUISE_INTERVAL_US)
         except FlightEndedError as end:

@@ -26,7 +26,7 @@ CURRENT_MODE = 436
 SAMPLED = (ATTITUDE, ATTITUDE_TARGET, HIL_ACTUATOR_CONTROLS, HIL_STATE_QUATERNION)
 """What a row is made of, streamed fast while something is measured and slower on the way there and back."""
 FAST_INTERVAL_US = 4_000
-CRUISE_INTERVAL_US = 10_000
+CRUISE_INTERVAL_US = 20_000
 
 ROWS_PER_BATCH = 500
 _MOTORS_SHOWN = 8

@@ -453,63 +453,82 @@ class Autopilot:
 
     # -- transitions -------------------------------------------------------------------------------------------
 
-    def _arming_problem(self) -> str:
+    def _health_problem(self) -> str:
+        """Why the vehicle cannot fly at all; PX4 says it before it denies arming."""
         if not self.ready:
-            return "sensors and position estimate not ready"
+            return "heading estimate invalid"
         if self.terminated:
             return "flight terminated"
-        if self.mode in NEVER_ARM:
-            return f"Mode not suitable for arming: {MODE_NAMES[self.mode]}"
-        if self.mode is Mode.OFFBOARD and not self._offboard_fresh():
-            return "No offboard signal"
         if self.motor_count == 0:
-            return "no rotor geometry (CA_ROTOR_COUNT is 0)"
+            return "no usable rotor geometry (CA_ROTOR_COUNT, CA_ROTORn_*)"
         return ""
 
-    def _refuse(self, text: str, severity: Severity = Severity.WARNING) -> Result:
-        self.rejection = text
-        self.say(severity, text)
+    def _mode_problem(self) -> str:
+        """Why it cannot arm in this mode; PX4 keeps that to itself."""
+        if self.mode in NEVER_ARM:
+            return f"mode not suitable for arming: {MODE_NAMES[self.mode]}"
+        if self.mode is Mode.OFFBOARD and not self._offboard_fresh():
+            return "no offboard signal"
+        return ""
+
+    def _refuse(self, text: str, reason: str = "") -> Result:
+        self.rejection = reason or text
+        self.say(Severity.CRITICAL, text)
         return Result.TEMPORARILY_REJECTED
 
-    def _aim_takeoff(self, altitude_amsl_m: float | None) -> None:
-        ground = self.home.position_ned[2] if self.home else 0.0
-        if altitude_amsl_m is None or not math.isfinite(altitude_amsl_m):
+    def _aim_takeoff(self) -> None:
+        down = self._plant.position_ned()[2]
+        wish_m = self._takeoff_amsl_m
+        if wish_m is None or not math.isfinite(wish_m):
             height = float(self.parameters.get("MIS_TAKEOFF_ALT"))
-            self.navigator.target_down = ground - height
+            target = down - height
+            self.say(Severity.INFO, f"Using default takeoff altitude: {height:.1f} m")
         else:
-            self.navigator.target_down = min(ground, ORIGIN[2] - altitude_amsl_m)
-            height = ground - self.navigator.target_down
-        self.say(Severity.INFO, f"Takeoff to {height:.1f} meters above home")
+            target = ORIGIN[2] - wish_m
+        if target > down:
+            target = down
+            self.say(Severity.CRITICAL, "Already higher than takeoff altitude")
+        self.navigator.target_down = target
 
     def _switch(self, mode: Mode) -> None:
         """The user's (or the mission's) choice of mode."""
         if self.mode not in NEVER_ARM and self.mode is not Mode.TAKEOFF:
             self._before_landing = self.mode
+        if mode is not self.mode:
+            self._offboard_level = control_loop.OFF
         self._intended = mode
-        self.failsafe = False
+        self.failsafe = self._tilt_warned
         self._enter(mode)
 
     def _enter(self, mode: Mode) -> None:
-        entering = mode is not self.mode
-        self.mode = mode
+        before, self.mode = self.mode, mode
         if not self.armed:
             return
+        stopped = int(self._input["level"][0]) == control_loop.OFF
         if mode in POSITION_MODES:
             _, _, yaw = to_euler(tuple(self._plant.quat.tolist()))
-            if entering and not self.land_detector.landed:
+            if before is not mode and not self.land_detector.landed:
                 self.navigator.airborne()
             self.navigator.enter(self._plant.position_ned(), self._plant.velocity_ned(), yaw)
-            self._position_state = np.zeros(1, POSITION_STATE)
-        elif entering or int(self._input["level"][0]) == control_loop.OFF:
+            if stopped or before not in POSITION_MODES:
+                self._position_state = np.zeros(1, POSITION_STATE)
+            if mode is Mode.TAKEOFF:
+                self._aim_takeoff()
+        elif stopped and self._offboard_level != control_loop.OFF:
+            # armed in Offboard: what was asked for last is flown at once
+            self._input["level"] = self._offboard_level
+            self._input["thrust_sp"] = self._attitude_sp.thrust
+        elif stopped:
             # armed in Offboard before the first set-point: hold still, no thrust
             self._input["level"] = control_loop.RATES
             self._input["rates_sp"] = 0.0
-            self._input["thrust_sp"] = self._attitude_sp.thrust if not self.land_detector.landed else 0.0
+            self._input["thrust_sp"] = 0.0
 
     def _disarm(self, text: str) -> None:
         self.armed = False
         self.terminated = False
         self.failsafe = False
+        self._tilt_warned = False
         self._input["level"] = control_loop.OFF
         self._input["thrust_sp"] = 0.0
         self.navigator.on_disarm()
@@ -523,6 +542,7 @@ class Autopilot:
         self.failsafe = True
         self.mode = self._intended = Mode.TERMINATION
         self._input["level"] = control_loop.OFF
+        self._input["thrust_sp"] = 0.0
 
     def _set_home(self) -> None:
         position = self._plant.position_ned()

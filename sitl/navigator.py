@@ -80,7 +80,7 @@ class Navigator:
         self.hold_ned = [position[0] + velocity[0] * reach, position[1] + velocity[1] * reach, position[2]]
         self.yaw = yaw
         self._climb = velocity[2]
-        self.descending = False
+        self.descending = self.state not in (TakeoffState.RAMPUP, TakeoffState.FLIGHT)
 
     def reached(self, down: float) -> bool:
         """Is the take-off height reached? down: m."""

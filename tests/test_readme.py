@@ -1,8 +1,9 @@
-"""The README and the code say the same: commands, files, tables, scripts and measured figures."""
+"""The README and the code say the same: commands, files, scripts, tables and measured figures."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import fnmatch
 import io
 import json
@@ -10,23 +11,29 @@ import re
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from scenarios import cli
+from scenarios.flight import FlightRecord
 from scenarios.limits import LIMIT_CYCLE_RAD_S, METRICS
-from scenarios.manoeuvres import KINDS
-from scenarios.profile_items import PROFILE_ITEMS
+from scenarios.manoeuvres import KINDS, make_manoeuvre
+from scenarios.runner import RunOptions, run_scenario
+from scenarios.scenario import list_scenarios, load_scenario
+from scenarios.table import cells
 from scenarios.telemetry import COLUMNS
 from sitl.errors import FileError, LinkError, UsageError
+from sitl.modes import AVAILABLE, MODE_NAMES
 from sitl.parameters import ParameterTable
 from sitl.profile import PROFILES
 
 ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = {name: (ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/architecture.md")}
+README = PAGES["README.md"]
 BLOCKS: list[tuple[str, str]] = re.findall(r"^```(\w+)\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
 COMMANDS = [
     line.partition("#")[0].split()[1:]
@@ -43,3 +50,295 @@ FILES = {
     if language in ("toml", "text") and (match := re.match(r"# (\S+\.(?:toml|params))\n", block))
 }
 """Every file shown: its name stands in its first line."""
+
+SCRIPTS = [block for language, block in BLOCKS if language == "python"]
+
+
+def table(first: str, second: str = "") -> list[list[str]]:
+    """Rows of the README's table whose head begins with these cells; backquotes and bold are taken off."""
+    lines = README.splitlines()
+    start = next(n for n, line in enumerate(lines) if line.startswith(f"| {first} | {second}"))
+    rows = []
+    for line in lines[start + 2 :]:
+        if not line.startswith("|"):
+            return rows
+        cells = re.split(r"(?<!\\)\|", line)[1:-1]
+        rows.append([re.sub(r"[`*]", "", cell).replace("\\|", "|").strip() for cell in cells])
+    return rows
+
+
+def shown(value: Any) -> str:
+    """A value as the README writes it."""
+    if value is None:
+        return "airframe's"
+    return ("yes" if value else "no") if isinstance(value, bool) else f"{value:g}"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with every file that the README shows; the process works in it."""
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+# -- what can be typed -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_every_command_shown_parses(words: list[str]) -> None:
+    assert callable(cli._parser().parse_args(words).run)
+
+
+def test_every_command_and_option_is_in_the_contract() -> None:
+    rows = {row[0].split()[1]: set(re.findall(r"--[a-z]+", row[0])) for row in table("command", "does")}
+    for name in ("airframes", "model", "fly", "sitl"):
+        with contextlib.redirect_stdout(io.StringIO()) as page, pytest.raises(SystemExit):
+            cli.main([name, "--help"])
+        assert rows[name] == set(re.findall(r"--[a-z]+", page.getvalue())) - {"--help"}, name
+    assert len(rows) == 4
+
+
+FLOWN = [words for words in COMMANDS if words[0] == "fly" and any(name in " ".join(words) for name in FILES)]
+
+
+@pytest.mark.parametrize("words", FLOWN, ids=" ".join)
+def test_the_files_shown_fly(words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status = cli.main([*words, "--json"])
+    run = json.loads(capsys.readouterr().out)
+    passed = all(flight["outcome"] == "PASS" for flight in run["flights"])
+    assert status == (cli.EXIT_GATE if "--gate" in words and not passed else cli.EXIT_OK)
+    assert run["complete"]
+    assert all(flight["rows"] > 1000 for flight in run["flights"])
+    assert (folder / run["folder"] / "compare.rrd").is_file()
+    if "--junit" in words:
+        assert (folder / words[words.index("--junit") + 1]).read_text().count("<testcase") == len(run["flights"])
+
+
+@pytest.mark.parametrize("words", [words for words in COMMANDS if words[0] in ("model", "airframes")], ids=" ".join)
+def test_the_models_shown_print(words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(words) == cli.EXIT_OK
+    assert "derivative" in capsys.readouterr().out
+
+
+def test_every_key_of_the_airframe_shown_is_needed_or_said_to_be_optional(folder: Path) -> None:
+    text = FILES["my_airframe.toml"]
+    for section in ("sigma", "flight_gains", "assumptions"):
+        head, _, rest = text.partition(f"[{section}]")
+        (folder / "less.toml").write_text(head + rest[rest.index("\n[") :], encoding="utf-8")
+        assert cli.main(["model", "less.toml"]) == cli.EXIT_OK, section
+
+
+REQUIRED: dict[str, dict[str, Any]] = {
+    "step": {"amplitude_deg": 10.0},
+    "doublet": {"amplitude_deg": 10.0},
+    "3211": {"amplitude_deg": 10.0},
+    "ramp": {"amplitude_deg": 10.0, "rate_deg_s": 10.0},
+    "chirp": {"amplitude_deg": 5.0, "duration_s": 5.0, "f0_hz": 0.5, "f1_hz": 2.0},
+    "multisine": {"peak_deg": 5.0, "duration_s": 5.0, "frequencies_hz": [1.0], "phases_rad": [0.0]},
+    "track": {},
+}
+
+
+def test_scenarios_and_manoeuvres_are_all_named_with_their_keys() -> None:
+    assert all(f"`{name}`" in README for name in list_scenarios())
+    rows = {kind: keys for kind, keys, _ in table("kind", "keys")}
+    assert list(rows) == list(KINDS)
+    for kind, keys in rows.items():
+        settings = make_manoeuvre(kind, **REQUIRED[kind]).settings
+        assert set(re.findall(r"[a-z][a-z0-9_]+_(?:deg|s|hz|rad)\b|sweep|rate_deg_s", keys)) == set(settings) - {"kind"}
+        for key, default in re.findall(r"(\w+_s) (\d[\d.]*)", keys):
+            assert settings[key] == float(default), (kind, key)
+
+
+# -- what is promised ------------------------------------------------------------------------------------------------
+
+
+def test_exit_status() -> None:
+    promised = {int(row[0]): row[1] for row in table("status", "when")}
+    assert list(promised) == [cli.EXIT_OK, cli.EXIT_GATE, cli.EXIT_USAGE, cli.EXIT_LINK, cli.EXIT_INTERRUPTED]
+    assert "--gate" in promised[cli.EXIT_GATE]
+    assert "Ctrl-C" in promised[cli.EXIT_INTERRUPTED]
+    assert UsageError.exit_status == FileError.exit_status == cli.EXIT_USAGE
+    assert LinkError.exit_status == cli.EXIT_LINK
+
+
+def test_telemetry_columns() -> None:
+    expected: list[list[str]] = []
+    for column in COLUMNS.values():
+        row = [column.name, np.dtype(column.dtype).name, column.unit, column.meaning]
+        row = [re.sub(r"\bmotor( ?)\d", r"motor\1N", cell) for cell in row]
+        if row not in expected:
+            expected.append(row)
+    assert table("column", "type") == expected
+    assert sum(name.startswith("motor") for name in COLUMNS) == 8
+
+
+def test_metrics() -> None:
+    assert table("metric", "unit") == [[name, unit, meaning] for name, (unit, meaning) in METRICS.items()]
+
+
+def test_profiles() -> None:
+    names = ("study", "sitl", "board")
+    values = {
+        item: [*(shown(getattr(PROFILES[name], item)) for name in names), unit]
+        for item, _, unit in PROFILES["sitl"].describe()
+        if item != "name"
+    }
+    assert {row[0]: row[2:] for row in table("item", "what")} == values
+
+
+def test_parameters() -> None:
+    parameters = ParameterTable()
+    count, idle = re.search(r"\*\*Parameters\*\*: (\d+),.*?do nothing yet: (.*?)\. A", README, re.DOTALL).groups()  # type: ignore[union-attr]
+    assert int(count) == len(parameters)
+    patterns = re.findall(r"[A-Z][A-Z0-9_*]+", idle)
+    named = {name for name in parameters.names for pattern in patterns if fnmatch.fnmatchcase(name, pattern)}
+    assert named == {name for name in parameters.names if not parameters.spec(name).obeyed}
+
+
+def test_modes() -> None:
+    modes, absent = re.search(r"\*\*Modes\*\*: (.*?) with .*?Not yet: (.*?);", README, re.DOTALL).groups()  # type: ignore[union-attr]
+    assert set(re.findall(r"[A-Z]\w+", modes)) == {MODE_NAMES[mode] for mode in AVAILABLE}
+    own = {"Descend", "Termination"}  # entered by failsafes only
+    assert set(re.findall(r"[A-Z]\w+", absent)) == set(MODE_NAMES.values()) - {MODE_NAMES[m] for m in AVAILABLE} - own
+
+
+def test_run_json_and_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["fly", "roll_step", "--gains", "px4_defaults", "--json"]) == cli.EXIT_OK
+    run = json.loads(capsys.readouterr().out)
+    assert [row[0] for row in table("key", "holds")] == list(run)
+    assert [row[0] for row in table("key of a flight", "holds")] == list(run["flights"][0]) == list(run["baseline"])
+    metric = re.search(r"A metric has (.*?)\. A value", README, re.DOTALL).group(1)  # type: ignore[union-attr]
+    assert re.findall(r"`(\w+)`", metric) == list(run["flights"][0]["metrics"][0])
+    there = {str(path.relative_to(run["folder"])) for path in Path(run["folder"]).rglob("*.*")}
+    promised = [row[0] for row in table("file", "what")]
+    slugs = ("px4_defaults", "own_ant-x")
+    assert there == {name.replace("<gain set>", slug) for name in promised for slug in slugs}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_what_is_linked_or_named_exists(page: str) -> None:
+    text, base = PAGES[page], (ROOT / page).parent
+    heads = {re.sub(r"[^a-z0-9 -]", "", h.lower()).replace(" ", "-") for h in re.findall(r"^#+ (.*)$", text, re.M)}
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if link.startswith("#"):
+            assert link[1:] in heads, link
+        elif not link.startswith("https://"):
+            assert (base / link).exists(), link
+    for path in re.findall(r"`((?:tests|sitl|bridge|scenarios|docs)/[\w./-]*)`", text):
+        assert (ROOT / path).exists(), path
+
+
+# -- what was measured -----------------------------------------------------------------------------------------------
+
+
+def fly(vehicle: str, gains: Sequence[str], column: str) -> dict[str, FlightRecord]:
+    """Fly the library's roll step; `column` is the head of a table: "study", or a motor lag."""
+    scenario = load_scenario("roll_step")
+    lag = re.match(r"(\d+) ms", column)
+    changes: dict[str, Any] = {"overrides": {"motor_lag_s": int(lag[1]) * 1e-3}} if lag else {"profile": "study"}
+    scenario = dataclasses.replace(scenario, vehicle=vehicle, gain_sets=tuple(gains), **changes)
+    run = run_scenario(scenario, RunOptions(out=None)).run
+    return {flight.gain_set.name: flight for flight in run.flights}
+
+
+def cell(flight: FlightRecord) -> str:
+    """A flight as the README's tables show it."""
+
+    def value(name: str) -> float | None:
+        metric = flight.metric(name)
+        assert metric is not None
+        return metric.value
+
+    oscillation, margin = value("oscillation_rad_s"), value("delay_margin_s")
+    assert oscillation is not None
+    assert margin is not None
+    if oscillation > LIMIT_CYCLE_RAD_S:
+        return f"{oscillation:.1f} rad/s at {value('oscillation_hz'):.1f} Hz; {1e3 * margin:.1f} ms"
+    settled = value("settling_time_5pct_s")
+    how = f"rise {value('rise_time_s'):.2f} s, droop {value('droop_deg'):.1f} deg"
+    if settled is not None:
+        how = f"overshoot {value('overshoot_pct'):.1f} %, settled in {settled:.2f} s"
+    return f"{how}; {1e3 * margin:.1f} ms"
+
+
+def same(text: str, measured: str) -> bool:
+    """Words alike, numbers within 5 %: another processor rounds differently."""
+    number = r"-?\d+\.\d+"
+    if re.sub(number, "0", text) != re.sub(number, "0", measured):
+        return False
+    pairs = zip(re.findall(number, text), re.findall(number, measured), strict=True)
+    return all(float(a) == pytest.approx(float(b), rel=0.05, abs=0.06) for a, b in pairs)
+
+
+def head(first: str) -> list[str]:
+    line = next(line for line in README.splitlines() if line.startswith(f"| {first} |"))
+    return [name.strip() for name in line.split("|")[2:-1]]
+
+
+@pytest.mark.parametrize("column", head("airframe"))
+def test_flight_gains_of_every_airframe(column: str) -> None:
+    for name, *texts in table("airframe", head("airframe")[0]):
+        (flight,) = fly(name, [f"table_2_2/{name}"], column).values()
+        assert same(texts[head("airframe").index(column)], cell(flight)), (name, column, cell(flight))
+
+
+@pytest.mark.parametrize("column", head("gain set"))
+def test_gains_of_table_7_2(column: str) -> None:
+    flights = fly("ant-x", ["table_7_2"], column)
+    rows = {name: texts[head("gain set").index(column)] for name, *texts in table("gain set", head("gain set")[0])}
+    assert list(rows) == list(flights)
+    for name, text in rows.items():
+        assert same(text, cell(flights[name])), (name, column, cell(flights[name]))
+
+
+def test_the_demo(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (printed,) = (block for language, block in BLOCKS if language == "text" and "verdict" in block)
+    scenario = load_scenario("demo")
+    flights = run_scenario(scenario, RunOptions(out=None)).run.flights
+    for flight in flights:
+        (line,) = (line for line in printed.splitlines() if line.startswith(flight.gain_set.name + " "))
+        assert line.split()[-1] == str(flight.outcome)
+        shown_cells = line.removeprefix(flight.gain_set.name).split()[:-1]
+        measured = " ".join(text for text, _ in cells(flight)).split()
+        assert same(" ".join(shown_cells), " ".join(measured)), (line, measured)
+
+
+# -- what can be copied ----------------------------------------------------------------------------------------------
+
+
+def test_scripts_are_python() -> None:
+    assert len(SCRIPTS) == 2
+    for script in SCRIPTS:
+        compile(script, "README.md", "exec")
+
+
+@pytest.fixture
+def port() -> Iterator[int]:
+    """A free port to which `froude sitl` sends."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        number: int = probe.getsockname()[1]
+    # fmt: off
+    command = [sys.executable, "-m", "scenarios.cli", "sitl", "ant-x", "--speed", "2",
+               "--link", f"udpout://127.0.0.1:{number}#onboard"]
+    # fmt: on
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE) as vehicle:
+        assert vehicle.stdout is not None
+        assert b"ANT-X is system 1" in vehicle.stdout.readline()
+        yield number
+        vehicle.terminate()
+        assert vehicle.wait(10) == 0
+
+
+@pytest.mark.client
+@pytest.mark.parametrize("script", SCRIPTS, ids=["mavsdk", "pymavlink"])
+def test_scripts_run(script: str, port: int) -> None:
+    pytest.importorskip("mavsdk.asyncio")
+    text = re.sub(r"127\.0\.0\.1:145[45]0", f"127.0.0.1:{port}", script)
+    assert str(port) in text
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "flying at" in done.stdout or "ATTITUDE" in done.stdout
