@@ -59,16 +59,16 @@ $(MADE):
 	    $(APT) install -y -qq --no-install-recommends python3-venv >/dev/null; } || { \
 	  echo "'$(PYTHON) -m venv' does not work here. As root: apt-get install python3-venv" >&2; exit 1; }; }
 	@echo "==> making $(VENV)"
-	@$(PYTHON) -m venv --clear $(VENV)
+	@$(PYTHON) -m venv $(VENV)
 	@touch $@
 
 $(FLIES): $(MADE) pyproject.toml constraints.txt
-	@echo "==> installing froude and what it flies with (numba, Rerun, Arrow and others: 1.1 GB on disk, about a minute)"
+	@echo "==> installing froude and what it flies with (numba, Rerun, Arrow and others: 1.3 GB on disk, half a minute or more)"
 	@$(PIP) --editable .
 	@touch $@
 
 $(TESTS): $(FLIES)
-	@echo "==> installing what the tests need (MAVSDK, MAVProxy, mypy and others: 1.3 GB more, about a minute)"
+	@echo "==> installing what the tests need (MAVSDK, MAVProxy, mypy and others: 1 GB more, a quarter of a minute or more)"
 	@$(PIP) --editable '.[test]'
 	@touch $@
 

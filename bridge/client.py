@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 from bridge.connection import Connection, Message
@@ -17,12 +16,13 @@ from bridge.errors import CommandRefused, NotReady, PeerSilent, UploadFailed
 from bridge.link import Link
 from bridge.param_client import ParamClient
 from bridge.param_operation import Outcome, ParamOperation, ParamValue
-from bridge.px4_modes import ARMED, PX4_MODES
+from bridge.px4_modes import PX4_MODES
+from bridge.vehicle_state import VehicleState
 from sitl.modes import Mode
 from sitl.parameters import ParameterType
 
 ACK_TIMEOUT_US = 500_000
-ACK_TRIES = 4
+ACK_TRIES = 10  # a command and its answer both get through a link that loses 30 % once in two tries
 HEARTBEAT_US = 1_000_000
 
 CMD_NAV_LAND = 21
@@ -33,38 +33,8 @@ CMD_SET_MESSAGE_INTERVAL = 511
 CMD_REQUEST_MESSAGE = 512
 
 _GCS, _INVALID_AUTOPILOT = 6, 8
-_PREARM_CHECK = 0x10000000
 _FORCE = 21196.0
 _ACCEPTED, _IN_PROGRESS = 0, 5
-_TEXT_CHUNK = 50
-
-_NAV_STATES = {mode.custom_mode: state for state, mode in reversed(PX4_MODES.items())}
-
-
-@dataclass
-class VehicleState:
-    """What the vehicle last said of itself.
-
-    Attributes:
-        nav_state: PX4's mode number, -1 before the first heartbeat. armed: motors may turn.
-        system_status: MAV_STATE. prearm_ok: it would arm in this mode. landed_state: MAV_LANDED_STATE.
-        home_alt_m: height of home above mean sea level, m; None until HOME_POSITION.
-        position_ned, velocity_ned: m, m/s; None until LOCAL_POSITION_NED.
-        euler, rates: rad, rad/s; None until ATTITUDE. thrust_sp: collective set-point, 0..1.
-    """
-
-    nav_state: int = -1
-    armed: bool = False
-    system_status: int = 0
-    prearm_ok: bool = False
-    landed_state: int = 0
-    home_alt_m: float | None = None
-    position_ned: tuple[float, float, float] | None = None
-    velocity_ned: tuple[float, float, float] | None = None
-    euler: tuple[float, float, float] | None = None
-    rates: tuple[float, float, float] | None = None
-    thrust_sp: float = 0.0
-    texts: list[tuple[int, int, str]] = field(default_factory=list)
 
 
 class Client:
@@ -106,19 +76,14 @@ class Client:
         self._subscribers: dict[str, list[Callable[[Message], object]]] = {}
         self._acks: list[tuple[int, int]] = []
         self._next_heartbeat_us = -1
-        self._chunks: dict[int, str] = {}
         self._own: dict[str, Callable[[Message], object]] = {
+            **self.state.handlers(),
             "HEARTBEAT": self._on_heartbeat,
             "ATTITUDE": self._on_attitude,
-            "ATTITUDE_TARGET": self._on_attitude_target,
             "LOCAL_POSITION_NED": self._on_local_position,
-            "SYS_STATUS": self._on_sys_status,
-            "EXTENDED_SYS_STATE": self._on_extended_sys_state,
-            "HOME_POSITION": self._on_home,
-            "CURRENT_MODE": self._on_current_mode,
+            "SYSTEM_TIME": self._on_system_time,
             "COMMAND_ACK": self._on_ack,
             "STATUSTEXT": self._on_text,
-            "SYSTEM_TIME": self._on_system_time,
         }
 
     def now_us(self) -> int:
@@ -132,16 +97,13 @@ class Client:
     # -- time and messages -------------------------------------------------------------------------------------
 
     def pump(self) -> None:
-        """Let some time pass and handle what came; send our heartbeat and due parameter requests."""
+        """Let some time pass and handle what came; send our heartbeat and what the background has due."""
         now = self.drive.now_us()
         if now >= self._next_heartbeat_us:
             self._next_heartbeat_us = now + HEARTBEAT_US
             self.send("HEARTBEAT", type=_GCS, autopilot=_INVALID_AUTOPILOT, mavlink_version=3)
         if self.background is not None:
             self.background(now)
-        if self.params.busy:
-            for name, fields in self.params.poll(now):
-                self.send(name, **fields)
         data = self.drive.wait(self.link)
         while data is not None:
             for message in self.connection.receive(data):
@@ -173,8 +135,8 @@ class Client:
         self.wait_until(lambda: False, duration_s)
 
     def _take(self, message: Message) -> None:
-        if self.target_system and message.sysid != self.target_system:
-            return
+        if message.sysid != self.target_system and (self.target_system or message.name != "HEARTBEAT"):
+            return  # another system's; before the first heartbeat nobody knows whose
         own = self._own.get(message.name)
         if own is not None:
             own(message)
@@ -189,34 +151,17 @@ class Client:
         if not self.target_system:
             self.target_system = m.sysid
             self.params.target_system = m.sysid
-        self.state.nav_state = _NAV_STATES.get(m.custom_mode, -1)
-        self.state.armed = bool(m.base_mode & ARMED)
-        self.state.system_status = m.system_status
-
-    def _on_current_mode(self, m: Message) -> None:
-        self.state.nav_state = _NAV_STATES.get(m.custom_mode, -1)
+        self.state.on_heartbeat(m)
 
     def _on_attitude(self, m: Message) -> None:
         self.drive.heard(m.time_boot_ms * 1000)
         self.state.euler = (m.roll, m.pitch, m.yaw)
         self.state.rates = (m.rollspeed, m.pitchspeed, m.yawspeed)
 
-    def _on_attitude_target(self, m: Message) -> None:
-        self.state.thrust_sp = m.thrust
-
     def _on_local_position(self, m: Message) -> None:
         self.drive.heard(m.time_boot_ms * 1000)
         self.state.position_ned = (m.x, m.y, m.z)
         self.state.velocity_ned = (m.vx, m.vy, m.vz)
-
-    def _on_sys_status(self, m: Message) -> None:
-        self.state.prearm_ok = bool(m.onboard_control_sensors_health & _PREARM_CHECK)
-
-    def _on_extended_sys_state(self, m: Message) -> None:
-        self.state.landed_state = m.landed_state
-
-    def _on_home(self, m: Message) -> None:
-        self.state.home_alt_m = m.altitude * 1e-3
 
     def _on_system_time(self, m: Message) -> None:
         self.drive.heard(m.time_boot_ms * 1000)
@@ -225,26 +170,19 @@ class Client:
         self._acks.append((m.command, m.result))
 
     def _on_text(self, m: Message) -> None:
-        text, number = m.text, m["id"]
-        if number:
-            text = self._chunks.pop(number, "") + text
-            if len(m.text) == _TEXT_CHUNK:
-                self._chunks[number] = text
-                return
-        text = text.rstrip("\t")
-        self.state.texts.append((self.now_us(), m.severity, text))
-        if self.on_text is not None:
+        text = self.state.on_text(m, self.now_us())
+        if text is not None and self.on_text is not None:
             self.on_text(self.now_us() * 1e-6, m.severity, text)
 
     # -- connect -----------------------------------------------------------------------------------------------
 
     def connect(self, timeout_s: float = 10.0) -> None:
-        """Wait for the autopilot's first heartbeat.
+        """Wait for the autopilot's first heartbeat and for its time: from then on timeouts mean something.
 
         Raises:
-            PeerSilent: none came in time.
+            PeerSilent: they did not come in time (over a network: within the drive's patience).
         """
-        if not self.wait_until(lambda: self.target_system != 0, timeout_s):
+        if not self.wait_until(lambda: self.target_system != 0 and self.drive.knows_time, timeout_s):
             raise PeerSilent(self.link.name, timeout_s, "a HEARTBEAT of an autopilot (component 1)")
 
     def wait_ready(self, timeout_s: float = 60.0) -> None:
@@ -406,4 +344,9 @@ class Client:
                 raise UploadFailed(operation.name, shown, seen, result.reason if result else "no answer in time")
 
     def _finish(self, operations: list[ParamOperation], timeout_s: float) -> None:
-        self.wait_until(lambda: all(operation.done for operation in operations), timeout_s)
+        def finished() -> bool:
+            for name, fields in self.params.poll(self.now_us()):
+                self.send(name, **fields)
+            return all(operation.done for operation in operations)
+
+        self.wait_until(finished, timeout_s)

@@ -13,7 +13,7 @@ unsigned.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from bridge.framing import MAGIC_2, Counters, FrameSplitter, crc16
@@ -71,6 +71,10 @@ class Connection:
             TypeError: the message has no such field.
             FieldError: the value does not fit the field.
         """
+        return self.encode_fields(name, fields)
+
+    def encode_fields(self, name: str, fields: Mapping[str, Any]) -> bytes:
+        """Return one frame, as `encode`, of fields that are a mapping already."""
         kind = BY_NAME.get(name)
         if kind is None:
             near = difflib.get_close_matches(name, BY_NAME, n=1)

@@ -13,6 +13,8 @@ from bridge.errors import PeerLost, PeerSilent
 from bridge.link import Link
 
 _SLICE_S = 0.02
+_LOOK_US = 100_000
+_JUMP_BACK_US = 1_000_000
 
 
 class Drive(ABC):
@@ -31,8 +33,13 @@ class Drive(ABC):
         """
 
     def heard(self, time_us: int) -> None:
-        """A message carried this vehicle time."""
+        """A message of the vehicle carried this vehicle time."""
         return
+
+    @property
+    def knows_time(self) -> bool:
+        """Whether `now_us` means something yet."""
+        return True
 
 
 class SharedDrive(Drive):
@@ -59,45 +66,59 @@ class NetworkDrive(Drive):
     """The vehicle is elsewhere: its time is what its messages say.
 
     Args:
-        patience_s: wall-clock silence after which the vehicle counts as lost, s; the escape that keeps a dead
-            peer from holding the caller for ever.
-        clock: measures that silence.
+        patience_s: wall-clock time without progress of the vehicle's clock after which the vehicle counts as lost,
+            s; the escape that keeps a dead peer, or one that talks of other things, from holding the caller for
+            ever.
+        clock: measures that time.
     """
 
     def __init__(self, patience_s: float = 5.0, clock: Clock | None = None) -> None:
         self.patience_s = patience_s
         self._clock: Clock = clock or WallClock()
         self._now_us = 0
-        self._ever_heard = False
-        self._alive_us = self._clock.now_us()
+        self._knows_time = False
+        self._looked_us = self._clock.now_us()
+        self._waited_us = 0
+        self._anything = False
 
     def now_us(self) -> int:
-        """Latest vehicle time heard, us."""
+        """Latest vehicle time heard, us; 0 before the first."""
         return self._now_us
+
+    @property
+    def knows_time(self) -> bool:
+        """Whether the vehicle has told its time."""
+        return self._knows_time
 
     def heard(self, time_us: int) -> None:
         """A message carried this vehicle time; a jump back means that the vehicle started anew."""
-        if time_us < self._now_us - 1_000_000:
+        if time_us < self._now_us - _JUMP_BACK_US:
             raise PeerLost(
                 "the vehicle",
-                f"its clock went back from {self._now_us / 1e6:.1f} s to {time_us / 1e6:.1f} s: it restarted",
+                f"its clock went back from {self._now_us / 1e6:.1f} s to {time_us / 1e6:.1f} s, so it has restarted",
             )
-        self._ever_heard = True
-        self._now_us = max(self._now_us, time_us)
+        if time_us > self._now_us or not self._knows_time:
+            self._now_us = max(self._now_us, time_us)
+            self._knows_time = True
+            self._waited_us = 0
 
     def wait(self, link: Link) -> bytes | None:
         """Listen for up to 20 ms."""
         data = link.recv(_SLICE_S)
         now = self._clock.now_us()
-        if data is not None:
-            self._alive_us = now
-        elif now - self._alive_us > self.patience_s * 1e6:
-            if self._ever_heard:
-                raise PeerLost(link.name, f"silent for {self.patience_s:g} s")
-            raise PeerSilent(
-                link.name,
-                self.patience_s,
-                "a MAVLink vehicle",
-                "Is the vehicle running, and does it send to this port? `froude sitl ant-x` starts one",
-            )
+        # A pause of this whole computer is no silence of the vehicle: each look counts 0.1 s at most.
+        self._waited_us += min(now - self._looked_us, _LOOK_US)
+        self._looked_us = now
+        self._anything = self._anything or data is not None
+        if self._waited_us > self.patience_s * 1e6:
+            raise self._given_up(link)
         return data
+
+    def _given_up(self, link: Link) -> PeerLost | PeerSilent:
+        if self._knows_time:
+            return PeerLost(link.name, f"nothing new from the vehicle for {self.patience_s:g} s")
+        if self._anything:
+            awaited = "an autopilot's HEARTBEAT with ATTITUDE or SYSTEM_TIME, though something does send here,"
+            return PeerSilent(link.name, self.patience_s, awaited, "Is it a MAVLink autopilot (component 1)?")
+        remedy = "Is the vehicle running, and does it send to this port? `froude sitl ant-x` starts one"
+        return PeerSilent(link.name, self.patience_s, "a MAVLink vehicle", remedy)

@@ -10,6 +10,7 @@ FroudeError
       +-- PeerLost         the peer was there and went away
       +-- LinkClosed       we closed the link and used it again
       +-- NotReady         the vehicle answers but will not become ready
+      +-- AlreadyArmed     somebody is flying it
       +-- CommandRefused   the vehicle said no
       +-- UploadFailed     a parameter did not end up as asked
 
@@ -137,6 +138,18 @@ class NotReady(LinkError):
         self.waited_s = waited_s
         self.missing = tuple(missing)
         super().__init__(f"{peer} is not ready after {waited_s:g} s; still missing: {', '.join(self.missing)}")
+
+
+class AlreadyArmed(LinkError):
+    """A vehicle that is armed before we have touched it: no gains are changed under somebody's hands.
+
+    Args:
+        peer: its address or system.
+    """
+
+    def __init__(self, peer: str) -> None:
+        self.peer = peer
+        super().__init__(f"{peer}: the vehicle is armed already. Land and disarm it, then fly again")
 
 
 class CommandRefused(LinkError):

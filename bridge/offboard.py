@@ -65,7 +65,7 @@ class OffboardSetpoints:
         problem = _problem(quat, rates, thrust, mask)
         if problem:
             server.refused += 1
-            server.say_at_times(Severity.WARNING, f"SET_ATTITUDE_TARGET ignored: {problem}")
+            server.say_at_times(Severity.WARNING, problem, f"SET_ATTITUDE_TARGET ignored: {problem}")
             return
         server.vehicle.autopilot.offboard_attitude(quat, rates, thrust)
         server.source.offboard_attitude = quat is not None
@@ -74,9 +74,8 @@ class OffboardSetpoints:
         server = self._server
         if server.is_for_us(msg):
             server.refused += 1
-            server.say_at_times(
-                Severity.WARNING, "Position set-points are not flown by this vehicle: send attitudes or rates"
-            )
+            text = "Position set-points are not flown by this vehicle: send attitudes or rates"
+            server.say_at_times(Severity.WARNING, "position", text)
 
 
 def _problem(quat: Sequence[float] | None, rates: Sequence[float], thrust: float, mask: int) -> str:

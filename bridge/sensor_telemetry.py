@@ -21,6 +21,7 @@ _ESTIMATOR_GOOD = 831  # attitude, velocities, positions and their predictions; 
 _HIGHRES_ALL_BUT_AIRSPEED = 0x1BFF
 _PWM_DISARMED_US = 900
 _TEMPERATURE_C = 15.0
+_MILLI_G = 1000.0 / _G
 _UTC_2001_US = 978_307_200_000_000
 
 
@@ -178,9 +179,9 @@ def hil_state_quaternion(source: Source) -> Fields:
     p, q, r = truth.rates()
     vx, vy, vz = truth.velocity_ned()
     ax, ay, az = truth.accel_body()
-    airspeed_cm_s = uint16(math.sqrt(vx * vx + vy * vy + vz * vz) * 100.0)
+    speed_cm_s = uint16(math.hypot(vx, vy, vz) * 100.0)
     return {
-        "time_usec": source.time_us,
+        "time_usec": vehicle.time_us,
         "attitude_quaternion": truth.quat(),
         "rollspeed": p,
         "pitchspeed": q,
@@ -191,11 +192,11 @@ def hil_state_quaternion(source: Source) -> Fields:
         "vx": int16(vx * 100.0),
         "vy": int16(vy * 100.0),
         "vz": int16(vz * 100.0),
-        "ind_airspeed": airspeed_cm_s,
-        "true_airspeed": airspeed_cm_s,
-        "xacc": int16(ax * 1000.0 / _G),
-        "yacc": int16(ay * 1000.0 / _G),
-        "zacc": int16(az * 1000.0 / _G),
+        "ind_airspeed": speed_cm_s,
+        "true_airspeed": speed_cm_s,
+        "xacc": int16(ax * _MILLI_G),
+        "yacc": int16(ay * _MILLI_G),
+        "zacc": int16(az * _MILLI_G),
     }
 
 

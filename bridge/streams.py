@@ -194,7 +194,7 @@ class Schedule:
 
     Args:
         mode: whose default rates; a memory link starts like an onboard one.
-        now_us: vehicle time; everything is due at once, then each at its interval.
+        now_us: vehicle time; HEARTBEAT is due at once, everything else one interval later.
     """
 
     def __init__(self, mode: LinkMode, now_us: int = 0) -> None:
@@ -206,7 +206,12 @@ class Schedule:
             hz = _START_HZ[mode].get(stream.name, 0.0)
             if hz:
                 self._slots[stream.message_id] = _Slot(stream, order, _interval_us(hz), now_us)
-        self._rebuild([(now_us, slot.order, slot) for slot in self._slots.values()])
+        self._rebuild(
+            [
+                (now_us if message_id == HEARTBEAT_ID else now_us + slot.interval_us, slot.order, slot)
+                for message_id, slot in self._slots.items()
+            ]
+        )
 
     def interval_us(self, message_id: int) -> int:
         """Return a message's interval in microseconds, OFF if it is not streamed."""
@@ -258,25 +263,25 @@ class Schedule:
                 heapq.heappop(heap)
                 self._waiting.append((due_us, slot))
             else:
-                fields = slot.build(source)
+                # Its next turn first: one that cannot be built or sent must not block the others.
                 heapq.heapreplace(heap, (_next_us(due_us, slot, now_us), slot.order, slot))
+                fields = slot.build(source)
                 if fields is not None:
                     send(slot.name, fields)
             due_us, _, slot = heap[0]
 
     def _send_news(self, now_us: int, source: Source, send: Callable[[str, Fields], None]) -> None:
         """Send what was due earlier, had nothing new then, and has now."""
-        still: list[tuple[int, _Slot]] = []
-        for due_us, slot in self._waiting:
-            if not slot.has_news(source, now_us):
-                still.append((due_us, slot))
-                continue
+        ready = [entry for entry in self._waiting if entry[1].has_news(source, now_us)]
+        if not ready:
+            return
+        self._waiting = [entry for entry in self._waiting if entry not in ready]
+        for due_us, slot in ready:
             heapq.heappush(self._heap, (_next_us(due_us, slot, now_us), slot.order, slot))
+        for _, slot in ready:
             fields = slot.build(source)
             if fields is not None:
                 send(slot.name, fields)
-        if len(still) != len(self._waiting):
-            self._waiting = still
 
     def _rebuild(self, entries: list[tuple[int, int, _Slot]]) -> None:
         self._waiting = []

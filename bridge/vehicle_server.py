@@ -11,6 +11,7 @@ and nothing else changes.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -18,7 +19,7 @@ from typing import Any
 from bridge.absent_services import AbsentServices
 from bridge.commands import Commands
 from bridge.connection import Connection, Message
-from bridge.errors import LinkClosed, PeerLost
+from bridge.errors import FieldError, LinkClosed, PeerLost
 from bridge.link import Link
 from bridge.offboard import OffboardSetpoints
 from bridge.param_protocol import ParamServer
@@ -38,6 +39,7 @@ _TEXTS_KEPT = 32
 _REPEAT_US = 1_000_000
 _DATAGRAMS_PER_TICK = 64
 _LOST_PEER_PAUSE_US = 100_000
+_LARGEST_FLOAT32 = 3.4028234663852886e38
 
 
 class ServerLink:
@@ -68,8 +70,13 @@ class ServerLink:
         self._text_id = 0
 
     def send(self, name: str, fields: Fields) -> None:
-        """Send one message now."""
-        self.link.send(self.connection.encode(name, **fields))
+        """Send one message now; what a diverging vehicle drives beyond float32 is sent as infinity."""
+        try:
+            frame = self.connection.encode_fields(name, fields)
+        except FieldError:
+            fields = {key: _float32(value) for key, value in fields.items()}
+            frame = self.connection.encode_fields(name, fields)
+        self.link.send(frame)
 
     def hears_gcs(self, now_us: int) -> bool:
         """Return whether a ground station is there."""
@@ -165,6 +172,8 @@ class VehicleServer:
                     link.schedule.run(now_us, self.source, link.send)
                 except (PeerLost, LinkClosed):
                     self._peer_lost(link)
+                except Exception as error:
+                    self._defect("telemetry", error)
         if now_us >= self._housekeeping_us:
             self._housekeeping_us = now_us + _HOUSEKEEPING_US
             self._keep_house()
@@ -187,11 +196,11 @@ class VehicleServer:
         for link in self.links:
             link.texts.append((self.vehicle.time_us, severity, text))
 
-    def say_at_times(self, severity: Severity, text: str) -> None:
-        """Send a text, the same one at most once a second: for what a stream of messages brings up."""
+    def say_at_times(self, severity: Severity, topic: str, text: str) -> None:
+        """Send a text, one on a topic at most once a second: for what a stream of messages brings up."""
         now_us = self.vehicle.time_us
-        if now_us - self._said_us.get(text, -_REPEAT_US) >= _REPEAT_US:
-            self._said_us[text] = now_us
+        if now_us - self._said_us.get(topic, -_REPEAT_US) >= _REPEAT_US:
+            self._said_us[topic] = now_us
             self.say(severity, text)
 
     def acknowledge(self, command: int, result: Result, sysid: int, compid: int) -> None:
@@ -238,11 +247,14 @@ class VehicleServer:
         except (PeerLost, LinkClosed):
             raise
         except Exception as error:
-            # A vehicle in the air outlives a message that nobody thought of; the defect is counted and said.
-            if self.strict:
-                raise
-            self.defects += 1
-            self.say_at_times(Severity.ERROR, f"{msg.name} hit a defect: {type(error).__name__}: {error}")
+            self._defect(msg.name, error)
+
+    def _defect(self, where: str, error: Exception) -> None:
+        """Count and say a bug: a vehicle in the air outlives a message that nobody thought of."""
+        if self.strict:
+            raise error
+        self.defects += 1
+        self.say_at_times(Severity.ERROR, where, f"{where} hit a defect: {type(error).__name__}: {error}")
 
     def _keep_house(self) -> None:
         """Send texts and parameters that wait."""
@@ -250,7 +262,7 @@ class VehicleServer:
         for text in self.vehicle.autopilot.take_texts():
             self.say(text.severity, text.text)
         for notice in self._params.take_notices():
-            self.say_at_times(Severity.WARNING, notice)
+            self.say_at_times(Severity.WARNING, "parameters", notice)
         for link in self.links:
             if now_us < link.resting_until_us:
                 continue
@@ -287,3 +299,12 @@ class VehicleServer:
         if msg.target_system == 0 and msg.target_component == 0:
             fields = {"time_usec": msg.time_usec, "seq": msg["seq"]}
             link.send("PING", {**fields, "target_system": msg.sysid, "target_component": msg.compid})
+
+
+def _float32(value: Any) -> Any:
+    """Return floats that float32 cannot hold as infinities, alone or in a sequence; anything else as it is."""
+    if isinstance(value, float) and abs(value) > _LARGEST_FLOAT32:
+        return math.copysign(math.inf, value)
+    if isinstance(value, (tuple, list)):
+        return [_float32(one) for one in value]
+    return value

@@ -5,9 +5,11 @@ Whatever goes wrong, what was flown so far is on disk and in the record before a
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +17,14 @@ from bridge.client import Client
 from bridge.clock import SimClock
 from bridge.connection import Connection
 from bridge.drive import Drive, NetworkDrive, SharedDrive
-from bridge.errors import CommandRefused, PeerLost, PeerSilent, UploadFailed
+from bridge.errors import AlreadyArmed, PeerLost, PeerSilent
 from bridge.link import Link, MemoryLink, open_link
 from bridge.param_operation import ParamValue
-from bridge.tlog import TlogWriter
 from bridge.vehicle_server import ServerLink, VehicleServer
-from scenarios import sampler
+from scenarios import interrupts, sampler
 from scenarios.flight import Event, FlightRecord
-from scenarios.gain_set import GainSet, save_params
+from scenarios.flight_files import FlightFiles
+from scenarios.gain_set import GainSet
 from scenarios.limits import Outcome, judge
 from scenarios.pilot import FlightLog, Pilot
 from scenarios.sampler import Sampler
@@ -30,7 +32,7 @@ from scenarios.scenario import Scenario
 from scenarios.score import diverged, flight_metrics
 from scenarios.telemetry import Telemetry
 from sitl.control_settings import mix_of
-from sitl.errors import FroudeError
+from sitl.errors import FroudeError, LinkError
 from sitl.parameters import ParameterTable, ParameterType
 from sitl.profile import Profile
 from sitl.sampled_loop import RollGains
@@ -47,6 +49,7 @@ _INTERVALS_US = {
 }
 _UNUSED_STREAMS = (4, 24, 26, 29, 31, 33, 36, 74, 85, 105, 111, 141, 147, 230, 241, 331)
 _READY_TIMEOUT_S = 60.0
+_BACKUP = ".backup.params"
 
 
 @dataclass(frozen=True)
@@ -85,13 +88,17 @@ class FlightStoppedError(Exception):
     """The flight is over before its time, and so is the run: record first, then tell.
 
     Args:
-        record: what was flown. cause: what to tell.
+        record: what was flown. cause: what to tell. owed: what is left to do on the vehicle by hand, if anything.
     """
 
-    def __init__(self, record: FlightRecord, cause: BaseException) -> None:
+    def __init__(self, record: FlightRecord, cause: BaseException, owed: str = "") -> None:
         super().__init__(str(cause))
         self.record = record
         self.cause = cause
+        self.owed = owed
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return FlightStoppedError, (self.record, self.cause, self.owed)
 
 
 def fly(job: FlightJob, progress: Callable[[str], object] = lambda _: None) -> FlightRecord:
@@ -104,14 +111,33 @@ def fly(job: FlightJob, progress: Callable[[str], object] = lambda _: None) -> F
         the record, scored.
 
     Raises:
-        FlightStoppedError: the link died, a parameter was refused, or Ctrl-C; carries the record so far.
+        FlightStoppedError: the link died, a parameter was refused, a file could not be written, or Ctrl-C; carries
+            the record so far.
     """
     flight = _Flight(job, progress)
     try:
         flight.run()
     except (FroudeError, KeyboardInterrupt) as cause:
-        raise FlightStoppedError(flight.finish(interrupted=cause), cause) from cause
-    return flight.finish()
+        with interrupts.held():
+            record = flight.finish(stopped=cause)
+        raise FlightStoppedError(record, cause, flight.owed) from cause
+    except BaseException:
+        flight.close()
+        raise
+    with interrupts.held():
+        record = flight.finish()
+    if flight.problem is not None:
+        raise FlightStoppedError(record, flight.problem)
+    return record
+
+
+@cache
+def _spare_the_collector() -> None:
+    """Take what is loaded by now out of the garbage collector's rounds, once per process.
+
+    A full round over the libraries' objects costs as much as a take-off, and they live as long as the process.
+    """
+    gc.freeze()
 
 
 class _Flight:
@@ -127,20 +153,30 @@ class _Flight:
         self._uploaded = False
         self._restored = False
         self._sampler: Sampler | None = None
-        self._recorder: Any = None
-        self._base = job.folder / job.gain_set.slug if job.folder else None
-        self._version: dict[str, Any] = {}
+        self._files: FlightFiles | None = None
 
     def run(self) -> None:
         """Everything that talks to the vehicle, with a teardown that always runs."""
         job = self._job
         self._progress("connect")
-        self._open_recorder()
+        if job.folder is not None:
+            self._files = self._stack.enter_context(
+                FlightFiles(
+                    job.folder,
+                    job.gain_set.slug,
+                    name=job.gain_set.name,
+                    rotors=job.model.airframe.rotors,
+                    live_port=job.live_port,
+                )
+            )
         client = self._open_client()
+        _spare_the_collector()
         client.on_text = self._on_text
         client.connect()
         self._set_streams(client)
         client.wait_ready(_READY_TIMEOUT_S)
+        if client.state.armed:
+            raise AlreadyArmed(client.link.name)
         pilot = Pilot(client, job.scenario, self._say(client), self._progress)
         self._log = pilot.log
         try:
@@ -150,22 +186,28 @@ class _Flight:
             self._tear_down(client, pilot)
 
     def _tear_down(self, client: Client, pilot: Pilot) -> None:
-        try:
-            pilot.come_down(may_force=self._job.in_memory)
-            self._restore(client)
-            if not self._job.in_memory:
-                for message_id in _INTERVALS_US:
-                    client.try_interval(message_id, 0)
-        except (PeerLost, PeerSilent, CommandRefused, UploadFailed) as error:
-            self._log.notes.append(f"teardown incomplete: {error}")
-            if not self._log.failure:
-                raise
+        """Land, restore, leave the streams as they were: each is tried even if the one before failed."""
+        trouble: LinkError | None = None
+        steps: list[Callable[[], object]] = [
+            lambda: pilot.come_down(may_force=self._job.in_memory),
+            lambda: self._restore(client),
+            lambda: self._default_streams(client),
+        ]
+        for step in steps:
+            try:
+                step()
+            except LinkError as error:
+                trouble = trouble or error
+                if isinstance(error, PeerLost | PeerSilent):
+                    break
+        if trouble is not None:
+            self._log.notes.append(f"teardown incomplete: {trouble}")
+            # a vehicle of our own that came to grief is thrown away; another is flown again, by somebody
+            if not (self._job.in_memory and self._log.failure):
+                raise trouble
 
     def _open_client(self) -> Client:
         job = self._job
-        log = None
-        if self._base is not None:
-            log = self._stack.enter_context(TlogWriter(self._base.with_name(self._base.name + ".tlog"))).write
         link: Link
         drive: Drive
         if job.in_memory:
@@ -178,8 +220,9 @@ class _Flight:
         else:
             link, drive = open_link(job.connect), NetworkDrive(job.patience_s)
         self._stack.callback(link.close)
-        client = Client(link, drive, log=log)
-        self._sampler = Sampler(client, self._inverse(), self._recorder.append if self._recorder else None)
+        files = self._files
+        client = Client(link, drive, log=files.frame if files else None)
+        self._sampler = Sampler(client, self._inverse(), files.rows if files else None)
         return client
 
     def _inverse(self) -> Any:
@@ -189,22 +232,6 @@ class _Flight:
             if name.startswith("CA_"):
                 table.set(name, value)
         return mix_of(table).inverse[:2]
-
-    def _open_recorder(self) -> None:
-        if self._base is None:
-            return
-        from scenarios.recorder import FlightRecorder
-
-        job = self._job
-        self._recorder = self._stack.enter_context(
-            FlightRecorder(
-                self._base.with_name(self._base.name + ".rrd"),
-                name=job.gain_set.name,
-                recording_id=f"{job.folder.parent.name if job.folder else 'flight'}-{job.gain_set.slug}",
-                rotors=job.model.airframe.rotors,
-                live_port=job.live_port,
-            )
-        )
 
     def _set_streams(self, client: Client) -> None:
         for message_id, interval_us in _INTERVALS_US.items():
@@ -216,16 +243,11 @@ class _Flight:
     def _upload(self, client: Client) -> None:
         self._progress("upload")
         self._backup = client.read_parameters(self._job.parameters)
-        if self._base is not None:
-            before = {name: value.value for name, value in self._backup.items()}
-            self._save(self._base.with_name(self._base.name + ".backup.params"), before)
-            flown = {name: value for name, (value, _) in self._job.parameters.items()}
-            self._save(self._base.with_name(self._base.name + ".params"), flown)
+        if self._files is not None:
+            self._files.parameters(_BACKUP, {name: value.value for name, value in self._backup.items()})
+            self._files.parameters(".params", {name: value for name, (value, _) in self._job.parameters.items()})
         self._uploaded = True
         client.upload(self._job.parameters)
-
-    def _save(self, path: Path, values: Mapping[str, float | int]) -> None:
-        save_params(path, values, ParameterTable())
 
     def _restore(self, client: Client) -> None:
         if not self._uploaded or self._restored:
@@ -234,29 +256,60 @@ class _Flight:
         client.upload({name: (value.raw, value.type) for name, value in self._backup.items()})
         self._restored = True
 
+    def _default_streams(self, client: Client) -> None:
+        if not self._job.in_memory:
+            for message_id in _INTERVALS_US:
+                client.try_interval(message_id, 0)
+
     def _on_text(self, t_s: float, severity: int, text: str) -> None:
         self._events.append(Event(t_s, severity, text))
-        if self._recorder is not None:
-            self._recorder.event(t_s, severity, text)
+        if self._files is not None:
+            self._files.event(t_s, severity, text)
 
     def _say(self, client: Client) -> Callable[[int, str], object]:
         return lambda severity, text: self._on_text(client.now_us() * 1e-6, severity, text)
 
     # -- the record --------------------------------------------------------------------------------------------
 
-    def finish(self, interrupted: BaseException | None = None) -> FlightRecord:
-        """Score what was flown and write its files."""
+    @property
+    def problem(self) -> FroudeError | None:
+        """The first file that could not be written."""
+        return self._files.problem if self._files is not None else None
+
+    @property
+    def owed(self) -> str:
+        """What is left to do on a vehicle that is not ours, in a sentence; empty if nothing."""
+        if not self._uploaded or self._restored or self._job.in_memory:
+            return ""
+        old = ", ".join(f"{name} = {value}" for name, value in self._backup.items())
+        remedy = f"load {self._files.path(_BACKUP)}" if self._files is not None else f"set {old}"
+        return f"The vehicle's own parameters were NOT restored: {remedy}"
+
+    def close(self) -> None:
+        """Let go of link and files as they are."""
+        self._stack.close()
+
+    def finish(self, stopped: BaseException | None = None) -> FlightRecord:
+        """Score what was flown, write its files and close everything.
+
+        Args:
+            stopped: what ended the flight before its time.
+        """
         job, log = self._job, self._log
         failure = log.failure
-        if interrupted is not None:
-            failure = "interrupted" if isinstance(interrupted, KeyboardInterrupt) else str(interrupted)
+        if stopped is not None:
+            why = "interrupted" if isinstance(stopped, KeyboardInterrupt) else str(stopped)
+            self._on_text(max(0.0, self._sampler.last_s) if self._sampler else 0.0, 2, f"flight stopped: {why}")
+            failure = failure or why
+            if self.owed:
+                log.notes.append(self.owed)
         segments = tuple(log.segments)
         telemetry = self._sampler.telemetry(segments) if self._sampler else Telemetry.empty()
         margins = flown_margins(job)
         metrics = flight_metrics(telemetry, segments, margins)
         failure = failure or diverged(telemetry)
         outcome, reason, metrics = judge(metrics, job.scenario.limits, failure)
-        if interrupted is not None and not log.failure:
+        if stopped is not None and not log.failure:
             outcome = Outcome.UNSET
         record = FlightRecord(
             gain_set=job.gain_set,
@@ -273,25 +326,10 @@ class _Flight:
             seed=job.scenario.seed,
             parameters={name: value for name, (value, _) in job.parameters.items()},
         )
-        self._write(record)
+        with self._stack:
+            if self._files is not None:
+                self._files.finish(record)
         return record
-
-    def _write(self, record: FlightRecord) -> None:
-        try:
-            if self._base is not None and len(record.telemetry):
-                record.telemetry.to_parquet(
-                    self._base.with_name(self._base.name + ".parquet"),
-                    {"gain_set": record.gain_set.name, "vehicle": record.vehicle_spec},
-                )
-            if self._recorder is not None:
-                from scenarios.markdown import flight_page
-                from scenarios.recorder.comparison import flight_properties
-
-                for segment in record.segments:
-                    self._recorder.segment(segment)
-                self._recorder.close(flight_page(record), flight_properties(record))
-        finally:
-            self._stack.close()
 
 
 def flown_margins(job: FlightJob) -> dict[str, Any]:

@@ -33,6 +33,7 @@ HOVER_AVERAGE_S = 1.0
 _HEIGHT_GAIN_1_M = 0.10
 _CLIMB_GAIN_S_M = 0.18
 _THRUST_MIN, _THRUST_MAX = 0.05, 0.98
+_CHECK_US = 20_000
 
 
 class FlightEndedError(Exception):
@@ -84,6 +85,7 @@ class Pilot:
         self._psi = 0.0
         self._down = 0.0
         self._watching = False
+        self._next_check_us = 0
 
     def fly(self) -> None:
         """Take off and fly every manoeuvre; `log` tells what became of it. Land with `come_down` afterwards."""
@@ -292,13 +294,15 @@ class Pilot:
         return max(abs(euler[0]), abs(euler[1])) if euler else 0.0
 
     def _check(self, least_height_m: float = LEAST_HEIGHT_M) -> None:
-        """End the flight if it is none any more."""
-        if not self._watching:
+        """End the flight if it is none any more; looks fifty times a second, however often it is asked."""
+        now_us = self._client.now_us()
+        if not self._watching or now_us < self._next_check_us:
             return
+        self._next_check_us = now_us + _CHECK_US
         state = self._client.state
         if self._tilt() > DIVERGED_RAD:
             raise FlightEndedError(f"diverged: tilt beyond {math.degrees(DIVERGED_RAD):g} deg")
-        if not state.armed and state.landed_state != LandedState.UNDEFINED and self._client.now_us() > 0:
+        if not state.armed and state.landed_state != LandedState.UNDEFINED:
             raise FlightEndedError("the vehicle disarmed in flight" + self._last_words())
         height = self._scenario.takeoff_altitude_m - (state.position_ned[2] - self._down) if state.position_ned else 0.0
         if height < least_height_m:

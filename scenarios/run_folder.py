@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 SCHEMA_VERSION = 1
 RUN_JSON = "run.json"
-FLIGHT_SUFFIXES = (".rrd", ".partial.rrd", ".parquet", ".tlog", ".params", ".backup.params")
+FLIGHT_SUFFIXES = (".rrd", ".partial.rrd", ".parquet", ".tlog", ".partial.tlog", ".params", ".backup.params")
 
 DERIVATIVE_UNITS: Mapping[str, str] = {
     "Yv": "1/s",

@@ -30,11 +30,9 @@ CRUISE_INTERVAL_US = 20_000
 
 ROWS_PER_BATCH = 500
 _MOTORS_SHOWN = 8
-_MOTORS_SENT = 16
-_VALUES = 7 + 8 + 6 + _MOTORS_SENT + 2
+_FIXED_VALUES = 7 + 8 + 6 + 2
 _NAN3 = (float("nan"),) * 3
 _NAN8 = (float("nan"),) * 8
-_NAN16 = (float("nan"),) * _MOTORS_SENT
 
 
 class Sampler:
@@ -59,12 +57,14 @@ class Sampler:
     ) -> None:
         self._state = client.state
         self._inverse = inverse
+        self._motor_count = inverse.shape[1]
+        self._values = _FIXED_VALUES + self._motor_count
         self._on_batch = on_batch
         self._attitude: tuple[float, ...] | None = None
         self._rates: tuple[float, ...] = _NAN3
         self._target: tuple[float, ...] = _NAN8
         self._position: tuple[float, ...] = _NAN3 + _NAN3
-        self._motors: Sequence[float] = _NAN16
+        self._motors: Sequence[float] = (float("nan"),) * self._motor_count
         self._true_rates: tuple[float, ...] | None = None
         # flat numbers, not a list of rows: nothing for the garbage collector to walk through while flying
         self._rows = array("d")
@@ -95,7 +95,7 @@ class Sampler:
         self._true_rates = (m.rollspeed, m.pitchspeed, m.yawspeed)
 
     def _on_motors(self, m: Message) -> None:
-        self._motors = m.controls
+        self._motors = m.controls[: self._motor_count]
 
     def _finish_row(self) -> None:
         if self._attitude is None:
@@ -107,14 +107,14 @@ class Sampler:
             (*self._attitude, *rates, *self._target, *self._position, *self._motors, state.nav_state, state.armed)
         )
         self._attitude = None
-        if len(self._rows) >= ROWS_PER_BATCH * _VALUES:
+        if len(self._rows) >= ROWS_PER_BATCH * self._values:
             self.flush()
 
     def flush(self) -> None:
         """Hand over the finished rows."""
         if not self._rows:
             return
-        columns = self._columns(np.array(self._rows).reshape(-1, _VALUES))
+        columns = self._columns(np.array(self._rows).reshape(-1, self._values))
         self._rows = array("d")
         self._batches.append(columns)
         if self._on_batch is not None:
@@ -131,14 +131,14 @@ class Sampler:
             columns[name] = rows[:, 11 + i]
         for i, name in enumerate(("north_m", "east_m", "down_m", "v_north_m_s", "v_east_m_s", "v_down_m_s")):
             columns[name] = rows[:, 15 + i]
-        motors = rows[:, 21 : 21 + _MOTORS_SENT]
-        count = self._inverse.shape[1]
+        count = self._motor_count
+        motors = rows[:, 21 : 21 + count]
         for i in range(_MOTORS_SHOWN):
             columns[f"motor{i + 1}"] = motors[:, i] if i < count else np.full(len(rows), np.nan)
-        delta = motors[:, :count] @ self._inverse.T
+        delta = motors @ self._inverse.T
         columns["delta_lat"], columns["delta_lon"] = delta[:, 0], delta[:, 1]
-        columns["nav_state"] = rows[:, 21 + _MOTORS_SENT].astype(np.int16)
-        columns["armed"] = rows[:, 22 + _MOTORS_SENT].astype(np.bool_)
+        columns["nav_state"] = rows[:, 21 + count].astype(np.int16)
+        columns["armed"] = rows[:, 22 + count].astype(np.bool_)
         return columns
 
     def telemetry(self, segments: Sequence[Segment]) -> Telemetry:

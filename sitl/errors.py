@@ -9,12 +9,25 @@ FroudeError
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 
 class FroudeError(Exception):
     """Base of every error whose text is written for a person; it is printed without a traceback."""
 
     exit_status = 2
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Flights may run in other processes. By default an unpickled exception is made from its text alone, which
+        # is not what the constructors of the subclasses take.
+        return _copy, (type(self), self.args, self.__dict__)
+
+
+def _copy(kind: type[FroudeError], args: tuple[Any, ...], attributes: dict[str, Any]) -> FroudeError:
+    error = kind.__new__(kind)
+    error.args = args
+    error.__dict__.update(attributes)
+    return error
 
 
 class UsageError(FroudeError):

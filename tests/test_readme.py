@@ -24,6 +24,7 @@ from scenarios.limits import LIMIT_CYCLE_RAD_S, METRICS
 from scenarios.manoeuvres import KINDS, make_manoeuvre
 from scenarios.runner import RunOptions, run_scenario
 from scenarios.scenario import list_scenarios, load_scenario
+from scenarios.table import COLUMNS as TABLE
 from scenarios.table import cells
 from scenarios.telemetry import COLUMNS
 from sitl.errors import FileError, LinkError, UsageError
@@ -113,7 +114,8 @@ def test_the_files_shown_fly(words: list[str], folder: Path, capsys: pytest.Capt
     assert all(flight["rows"] > 1000 for flight in run["flights"])
     assert (folder / run["folder"] / "compare.rrd").is_file()
     if "--junit" in words:
-        assert (folder / words[words.index("--junit") + 1]).read_text().count("<testcase") == len(run["flights"])
+        junit = (folder / words[words.index("--junit") + 1]).read_text()
+        assert junit.count('name="verdict"') == len(run["flights"])
 
 
 @pytest.mark.parametrize("words", [words for words in COMMANDS if words[0] in ("model", "airframes")], ids=" ".join)
@@ -218,6 +220,16 @@ def test_run_json_and_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -
     assert there == {name.replace("<gain set>", slug) for name in promised for slug in slugs}
 
 
+def test_the_same_bytes_again_and_two_at_a_time() -> None:
+    scenario = dataclasses.replace(load_scenario("roll_step"), gain_sets=("table_7_2/ANT-R", "table_2_2/ANT-X"))
+    hashes = [
+        [flight.telemetry_sha256 for flight in run_scenario(scenario, RunOptions(out=None, jobs=jobs)).run.flights]
+        for jobs in (1, 1, 2)
+    ]
+    assert hashes[0] == hashes[1] == hashes[2]
+    assert len(set(hashes[0])) == 2
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_what_is_linked_or_named_exists(page: str) -> None:
     text, base = PAGES[page], (ROOT / page).parent
@@ -255,6 +267,7 @@ def cell(flight: FlightRecord) -> str:
     oscillation, margin = value("oscillation_rad_s"), value("delay_margin_s")
     assert oscillation is not None
     assert margin is not None
+    assert (oscillation > LIMIT_CYCLE_RAD_S) is (margin < 0.0)
     if oscillation > LIMIT_CYCLE_RAD_S:
         return f"{oscillation:.1f} rad/s at {value('oscillation_hz'):.1f} Hz; {1e3 * margin:.1f} ms"
     settled = value("settling_time_5pct_s")
@@ -294,16 +307,19 @@ def test_gains_of_table_7_2(column: str) -> None:
         assert same(text, cell(flights[name])), (name, column, cell(flights[name]))
 
 
-def test_the_demo(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_the_demo() -> None:
     (printed,) = (block for language, block in BLOCKS if language == "text" and "verdict" in block)
-    scenario = load_scenario("demo")
-    flights = run_scenario(scenario, RunOptions(out=None)).run.flights
+    flights = run_scenario(load_scenario("demo"), RunOptions(out=None)).run.flights
     for flight in flights:
         (line,) = (line for line in printed.splitlines() if line.startswith(flight.gain_set.name + " "))
         assert line.split()[-1] == str(flight.outcome)
-        shown_cells = line.removeprefix(flight.gain_set.name).split()[:-1]
-        measured = " ".join(text for text, _ in cells(flight)).split()
-        assert same(" ".join(shown_cells), " ".join(measured)), (line, measured)
+        now = {column.metrics[0]: text for column, (text, _) in zip(TABLE, cells(flight), strict=True)}
+        then = dict(
+            zip(now, re.findall(r"[-\d.]+ @ [\d.]+|\S+", line.removeprefix(flight.gain_set.name)), strict=False)
+        )
+        # The phase of a limit cycle, and what depends on it, differs between processors.
+        robust = ("oscillation_rad_s", "delay_margin_s") if "@" in now["oscillation_rad_s"] else now
+        assert all(same(then[name], now[name]) for name in robust), (then, now)
 
 
 # -- what can be copied ----------------------------------------------------------------------------------------------

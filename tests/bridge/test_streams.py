@@ -20,8 +20,8 @@ class Stub:
     """A source that counts set-points; every message is built from it without a vehicle."""
 
     def __init__(self) -> None:
-        self.count = 0
-        self.vehicle: Any = SimpleNamespace(autopilot=SimpleNamespace(attitude_sp=self))
+        self.autopilot = SimpleNamespace(attitude_sp_count=0)
+        self.vehicle: Any = SimpleNamespace(autopilot=self.autopilot)
 
 
 @pytest.fixture
@@ -145,7 +145,7 @@ class TestAttitudeTarget:
         sent: list[int] = []
         for tick in range(1, 101):
             if tick % 5 == 0:
-                source.count += 1
+                source.autopilot.attitude_sp_count += 1
             schedule.run(tick * TICK_US, source, lambda name, _, t=tick: sent.append(t) if name != "HEARTBEAT" else 0)
         assert sent == list(range(5, 101, 5))
 
@@ -158,7 +158,7 @@ class TestAttitudeTarget:
             sent += name == "ATTITUDE_TARGET"
 
         for tick in range(500):
-            source.count += 1
+            source.autopilot.attitude_sp_count += 1
             schedule.run(tick * TICK_US, source, count)
         assert sent == 100
 

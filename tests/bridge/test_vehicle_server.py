@@ -433,6 +433,32 @@ class TestRobustness:
         with pytest.raises(ZeroDivisionError):
             one.run(0.1, one.set_point)
 
+    def test_a_vehicle_that_diverges_is_still_heard(self, on_ground: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+        for state in (on_ground.vehicle.estimate, on_ground.vehicle.truth):
+            monkeypatch.setattr(state, "rates", lambda: (1e40, -1e300, math.nan))
+            monkeypatch.setattr(state, "velocity_ned", lambda: (1e40, -1e40, math.nan))
+            monkeypatch.setattr(state, "position_ned", lambda: (1e6, math.inf, -1e39))
+        on_ground.run(1.1)
+        heard = {message.name: message for _, message in on_ground.ground.heard}
+        assert (heard["ATTITUDE"].rollspeed, heard["ATTITUDE"].pitchspeed) == (math.inf, -math.inf)
+        assert math.isnan(heard["ATTITUDE"].yawspeed)
+        place = heard["GLOBAL_POSITION_INT"]
+        assert (place.vx, place.vy, place.vz) == (32767, -32768, 0)
+        for message_id in (331, 105, 26, 74, 141, 115):
+            assert on_ground.result(512, message_id) == 0
+
+    def test_telemetry_that_cannot_be_built_does_not_hold_up_the_rest(
+        self, flight: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        one = flight(strict=False)
+        monkeypatch.setattr(one.vehicle.estimate, "quat", lambda: 1 / 0)
+        one.run(2.0)
+        heard = one.ground.counts()
+        assert heard["ATTITUDE_QUATERNION"] == 0
+        assert heard["LOCAL_POSITION_NED"] == pytest.approx(100, abs=2)
+        assert heard["GLOBAL_POSITION_INT"] == pytest.approx(100, abs=2)
+        assert one.server.defects >= 99
+
     def test_a_flood_is_read_over_several_ticks(self, on_ground: Any) -> None:
         for _ in range(500):
             on_ground.ground.send("COMMAND_LONG", target_system=1, target_component=1, command=400)

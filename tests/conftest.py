@@ -1,0 +1,104 @@
+"""What several folders of tests fly with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from sitl.modes import Mode, Result
+from sitl.parameters import ParameterTable
+from sitl.profile import get_profile
+from sitl.vehicle import Vehicle
+from sitl.vehicle_spec import VehicleModel, resolve_vehicle
+
+Each = Callable[[int], None]
+
+
+class Flight:
+    """A vehicle with the texts it said, in order, as (vehicle time in s, text)."""
+
+    def __init__(
+        self,
+        model: str | VehicleModel = "ant-x",
+        profile: str = "sitl",
+        *,
+        seed: int = 1,
+        parameters: ParameterTable | None = None,
+        flight_gains: bool = True,
+        **overrides: object,
+    ) -> None:
+        resolved = resolve_vehicle(model) if isinstance(model, str) else model
+        self.vehicle = Vehicle(resolved, get_profile(profile, **overrides), seed=seed, parameters=parameters)
+        self.autopilot = self.vehicle.autopilot
+        self.parameters = self.vehicle.parameters
+        self.texts: list[tuple[float, str]] = []
+        gains = resolved.airframe.flight_gains
+        if flight_gains and gains is not None:
+            for axis in ("ROLL", "PITCH"):
+                self.set_gains(axis, gains.k_phi, gains.kp, gains.ki, gains.kd)
+
+    @property
+    def time_s(self) -> float:
+        return self.vehicle.time_us * 1e-6
+
+    def set_gains(self, axis: str, k_phi: float, kp: float, ki: float, kd: float) -> None:
+        self.parameters.set(f"MC_{axis}_P", float(k_phi))
+        for suffix, value in (("P", kp), ("I", ki), ("D", kd)):
+            self.parameters.set(f"MC_{axis}RATE_{suffix}", float(value))
+
+    def run(self, seconds: float, each: Each | None = None) -> None:
+        """Step on; ``each`` is called with the number of the step before every step."""
+        for k in range(round(seconds * 1e6 / self.vehicle.tick_us)):
+            if each is not None:
+                each(k)
+            self.vehicle.step()
+            self.listen()
+
+    def listen(self) -> None:
+        """Note what was said."""
+        self.texts += [(self.time_s, text.text) for text in self.autopilot.take_texts()]
+
+    def run_until(self, condition: Callable[[], bool], timeout_s: float) -> float:
+        """Step on until a condition holds, looked at every 20 ms; s it took."""
+        start = self.time_s
+        while not condition():
+            assert self.time_s - start < timeout_s, f"not within {timeout_s} s; said {self.texts}"
+            self.run(0.02)
+        return self.time_s - start
+
+    def said(self, text: str) -> list[float]:
+        """When a text was said, s."""
+        return [time_s for time_s, said in self.texts if said == text]
+
+    def get_ready(self) -> None:
+        self.run_until(lambda: self.autopilot.ready, 5.0)
+
+    def arm(self) -> float:
+        """Arm; vehicle time of it, s."""
+        if not self.autopilot.ready:
+            self.get_ready()
+        assert self.autopilot.command_arm(True) is Result.ACCEPTED, self.autopilot.rejection
+        self.listen()
+        return self.time_s
+
+    def take_off(self, height_m: float = 10.0, settle_s: float = 5.0) -> None:
+        """Arm, take off and hold until the height is still."""
+        self.parameters.set("MIS_TAKEOFF_ALT", height_m)
+        self.arm()
+        assert self.autopilot.command_takeoff(None) is Result.ACCEPTED
+        self.run_until(lambda: self.autopilot.mode is Mode.LOITER, 60.0)
+        self.run(settle_s)
+
+    def go_offboard(self, thrust: float | None = None) -> None:
+        """Switch to Offboard, level, with thrust for hover unless told."""
+        wanted = self.vehicle.model.assumptions.hover_thrust if thrust is None else thrust
+        self.autopilot.offboard_attitude((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), wanted)
+        assert self.autopilot.command_mode(Mode.OFFBOARD) is Result.ACCEPTED
+        self.autopilot.offboard_attitude((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), wanted)
+
+
+@pytest.fixture
+def flight() -> type[Flight]:
+    """The class to make a flight of."""
+    return Flight
