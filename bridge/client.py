@@ -24,6 +24,7 @@ from sitl.parameters import ParameterType
 ACK_TIMEOUT_US = 500_000
 ACK_TRIES = 10  # a command and its answer both get through a link that loses 30 % once in two tries
 HEARTBEAT_US = 1_000_000
+LONGEST_WAIT_US = 20_000
 
 CMD_NAV_LAND = 21
 CMD_NAV_TAKEOFF = 22
@@ -50,7 +51,8 @@ class Client:
     Attributes:
         state: what the vehicle last said.
         on_text: called with (vehicle time s, severity, text) of every STATUSTEXT.
-        background: called with the vehicle time (us) before every wait: a set-point stream that must not pause.
+        background: called with the vehicle time (us) before every wait, returns when it is due again: a set-point
+            stream that must not pause.
     """
 
     def __init__(
@@ -71,7 +73,7 @@ class Client:
         self.target_system = 0
         self.target_component = 1
         self.on_text: Callable[[float, int, str], object] | None = None
-        self.background: Callable[[int], object] | None = None
+        self.background: Callable[[int], int] | None = None
         self.params = ParamClient(0, 1, own_system=sysid)
         self._subscribers: dict[str, list[Callable[[Message], object]]] = {}
         self._acks: list[tuple[int, int]] = []
@@ -96,15 +98,20 @@ class Client:
 
     # -- time and messages -------------------------------------------------------------------------------------
 
-    def pump(self) -> None:
-        """Let some time pass and handle what came; send our heartbeat and what the background has due."""
+    def pump(self, until_us: int | None = None) -> None:
+        """Let time pass and handle what came; send our heartbeat and what the background has due.
+
+        Args:
+            until_us: vehicle time not to let pass; 20 ms from now if None, or if that is sooner.
+        """
         now = self.drive.now_us()
         if now >= self._next_heartbeat_us:
             self._next_heartbeat_us = now + HEARTBEAT_US
             self.send("HEARTBEAT", type=_GCS, autopilot=_INVALID_AUTOPILOT, mavlink_version=3)
+        until = now + LONGEST_WAIT_US if until_us is None or until_us > now + LONGEST_WAIT_US else until_us
         if self.background is not None:
-            self.background(now)
-        data = self.drive.wait(self.link)
+            until = min(until, self.background(now))
+        data = self.drive.wait(self.link, until)
         while data is not None:
             for message in self.connection.receive(data):
                 self._take(message)
@@ -127,7 +134,7 @@ class Client:
         while not condition():
             if self.now_us() >= deadline:
                 return False
-            self.pump()
+            self.pump(deadline)
         return True
 
     def wait(self, duration_s: float) -> None:

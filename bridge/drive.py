@@ -25,8 +25,14 @@ class Drive(ABC):
         """Vehicle time as far as it is known, us since the vehicle's boot."""
 
     @abstractmethod
-    def wait(self, link: Link) -> bytes | None:
-        """Let some time pass; bytes that came meanwhile, if any.
+    def wait(self, link: Link, until_us: int) -> bytes | None:
+        """Let time pass until something comes.
+
+        Args:
+            link: what to listen to. until_us: vehicle time at which the caller has something to do itself.
+
+        Returns:
+            what came; None at `until_us`, or earlier.
 
         Raises:
             LinkError: the peer went away or never answered.
@@ -56,10 +62,15 @@ class SharedDrive(Drive):
         """Vehicle time, us."""
         return self._clock.now_us()
 
-    def wait(self, link: Link) -> bytes | None:
-        """Let one tick pass."""
-        self._clock.advance()
-        return link.recv()
+    def wait(self, link: Link, until_us: int) -> bytes | None:
+        """Let ticks pass, one at least, until something comes or `until_us` is reached."""
+        clock = self._clock
+        clock.advance()
+        data = link.recv()
+        while data is None and clock.now_us() < until_us:
+            clock.advance()
+            data = link.recv()
+        return data
 
 
 class NetworkDrive(Drive):
@@ -102,8 +113,8 @@ class NetworkDrive(Drive):
             self._knows_time = True
             self._waited_us = 0
 
-    def wait(self, link: Link) -> bytes | None:
-        """Listen for up to 20 ms."""
+    def wait(self, link: Link, until_us: int) -> bytes | None:
+        """Listen for up to 20 ms of wall time; vehicle time moves only with what comes."""
         data = link.recv(_SLICE_S)
         now = self._clock.now_us()
         # A pause of this whole computer is no silence of the vehicle: each look counts 0.1 s at most.

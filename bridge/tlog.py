@@ -17,6 +17,7 @@ from sitl.errors import FileError
 SIMULATED_EPOCH_US = 1_577_836_800_000_000
 
 _STAMP = struct.Struct(">Q")
+_MOST_WAITING = 256
 
 
 class TlogWriter:
@@ -33,7 +34,8 @@ class TlogWriter:
     def __init__(self, path: str | Path, *, epoch_us: int = SIMULATED_EPOCH_US) -> None:
         self.path = Path(path)
         self.epoch_us = epoch_us
-        self.frames = 0
+        self._written = 0
+        self._waiting: list[bytes] = []
         try:
             self._file = self.path.open("wb")
         except OSError as error:
@@ -46,14 +48,32 @@ class TlogWriter:
             time_us: when it passed, in microseconds from the epoch; never negative.
             frame: the whole frame.
         """
+        waiting = self._waiting
+        waiting.append(_STAMP.pack(self.epoch_us + time_us))
+        waiting.append(frame)
+        if len(waiting) >= _MOST_WAITING:
+            self.flush()
+
+    @property
+    def frames(self) -> int:
+        """Frames appended so far."""
+        return self._written + len(self._waiting) // 2
+
+    def flush(self) -> None:
+        """Hand what waits to the operating system: from here on a killed process loses nothing of it."""
+        self._written += len(self._waiting) // 2
+        data, self._waiting = b"".join(self._waiting), []
         try:
-            self._file.write(_STAMP.pack(self.epoch_us + time_us) + frame)
+            self._file.write(data)
+            self._file.flush()
         except OSError as error:
             raise self._unwritable(error) from None
-        self.frames += 1
 
     def close(self) -> None:
-        """Write what is buffered and release the file; may be repeated."""
+        """Write what waits and release the file; may be repeated."""
+        if self._file.closed:
+            return
+        self.flush()
         try:
             self._file.close()
         except OSError as error:

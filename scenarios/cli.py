@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 EXIT_OK, EXIT_GATE, EXIT_USAGE, EXIT_LINK, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 
 _PROFILES = ("study", "sitl", "board")
-_SCALINGS = "derivatives,uncertainty,gain"
+_SCALINGS = "derivatives, uncertainty or uncertainty-grow, gain; joined by commas"
 
 
 class _Parser(argparse.ArgumentParser):
@@ -55,11 +55,18 @@ def _parser() -> argparse.ArgumentParser:
         "Upload gain sets, fly manoeuvres, say which sets pass.",
         "froude fly --vehicle ant-x --gains table_7_2 table_2_2/ANT-X",
     )
-    sub.add_argument("scenario", nargs="?", default="demo", help="name in the library or .toml file (default: demo)")
+    library = ", ".join(_names("library"))
+    sub.add_argument("scenario", nargs="?", default="demo", help=f"a .toml file, or one of {library} (default: demo)")
     sub.add_argument("--vehicle", metavar="SPEC", help="airframe, or reference:target")
     _vehicle_options(sub)
-    sub.add_argument("--gains", nargs="+", metavar="NAME|FILE", help="gain sets: table_7_2, table_2_2/ANT-X, x.params")
+    sub.add_argument(
+        "--gains",
+        nargs="+",
+        metavar="NAME|FILE",
+        help=f"a .toml or .params file, or {', '.join(_names('gain_sets'))}; one set of a file as table_2_2/ANT-X",
+    )
     sub.add_argument("--connect", metavar="URL", help="fly this vehicle, such as udpin://127.0.0.1:14540")
+    sub.add_argument("--arm-hardware", action="store_true", help="allow arming on a serial link: propellers may turn")
     sub.add_argument("--seed", type=int, metavar="N", help="of sensor noise")
     sub.add_argument("--jobs", type=int, default=1, metavar="N", help="flights at a time (default: 1)")
     sub.add_argument("--live", action="store_true", help="serve a Rerun viewer on 127.0.0.1 while flying")
@@ -76,6 +83,11 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--instance", type=int, default=0, metavar="N", help="PX4's port and system id offset")
     sub.add_argument("--seed", type=int, default=0, metavar="N", help="of sensor noise")
     return parser
+
+
+def _names(folder: str) -> list[str]:
+    """Names of the .toml files in a folder of this package."""
+    return sorted(path.stem for path in (Path(__file__).parent / folder).glob("*.toml"))
 
 
 def _vehicle_options(parser: argparse.ArgumentParser) -> None:
@@ -107,23 +119,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_USAGE
     try:
         status: int = args.run(args)
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.flush()
         return status
     except FroudeError as error:
         return _tell(str(error), error.exit_status)
     except KeyboardInterrupt:
         return _tell("interrupted", EXIT_INTERRUPTED)
     except BrokenPipeError:
-        # the reader of our output went away (froude ... | head): nothing is wrong, and nothing can be told
-        sys.stderr.close()
+        # the reader of our output went away (froude model ... | head): nothing is wrong, and nothing can be told
+        _mute_stdout()
         return EXIT_OK
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _tell(f"{where}{error.strerror or error}. Check the path, permissions and free space", EXIT_USAGE)
 
 
-def _tell(text: str, status: int) -> int:
-    print(f"froude: {text}", file=sys.stderr)
+def _tell(text: str, status: int = EXIT_OK) -> int:
+    if sys.stderr is not None:  # None: closed by whoever started us, and print would write to stdout instead
+        print(f"froude: {text}", file=sys.stderr, flush=True)
     return status
 
 
@@ -186,48 +200,91 @@ def _scenario(args: argparse.Namespace) -> Scenario:
 
 
 def _fly(args: argparse.Namespace) -> int:
+    import os
+
+    from scenarios import interrupts
     from scenarios.one_flight import MEMORY
     from scenarios.runner import RunOptions, run_scenario
 
+    _check_junit(args.junit)
     scenario = _scenario(args)
     options = RunOptions(
         out=args.out,
         connect=args.connect or MEMORY,
+        arm_hardware=args.arm_hardware,
         jobs=args.jobs,
         live_port=_live_port() if args.live else None,
         command=("froude", *args.argv),
     )
     if options.live_port is not None:
-        print(f"live: rerun --connect rerun+http://127.0.0.1:{options.live_port}/proxy", file=sys.stderr)
-    with _progress_bar() as progress:
-        result = run_scenario(scenario, options, progress)
-    return _report(args, result)
+        _tell(f"live view: rerun --connect rerun+http://127.0.0.1:{options.live_port}/proxy")
+    # Rerun's own log lines come from other threads, right through the table; what they say we find out ourselves.
+    os.environ.setdefault("RUST_LOG", "off")
+    landing = "stopping: the vehicle lands and gets its parameters back; Ctrl-C again leaves it as it is"
+    with interrupts.caught(lambda: _tell(landing) if args.connect else None):
+        with _progress_bar() as progress:
+            result = run_scenario(scenario, options, progress)
+        return _report(args, result)
+
+
+def _check_junit(path: Path | None) -> None:
+    """Better now than after an hour of flying."""
+    from sitl.errors import FileError
+
+    if path is not None and not path.parent.is_dir():
+        raise FileError(path, "its folder does not exist", "Make the folder, or write --junit to another place")
 
 
 def _report(args: argparse.Namespace, result: RunResult) -> int:
+    """Print the result; the exit status that it means."""
     from scenarios.limits import Outcome
     from scenarios.run_folder import RunFolder, run_object
     from scenarios.table import run_text, terminal_width
+    from sitl.errors import FroudeError
 
-    run, folder = result.run, result.folder
+    run, folder, stopped = result.run, result.folder, result.stopped
+    if args.json:
+        shown = run_object(run, RunFolder(folder) if folder else None, ("froude", *args.argv))
+        _show(json.dumps(shown, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    else:
+        width, colour = terminal_width(sys.stdout)
+        _show(run_text(run, folder, width=width, colour=colour))
     if args.junit is not None:
         from scenarios.junit import write_junit
 
-        write_junit(run, args.junit)
-    if args.json:
-        shown = run_object(run, RunFolder(folder) if folder else None, ("froude", *args.argv))
-        print(json.dumps(shown, indent=2, ensure_ascii=False, allow_nan=False))
-    else:
-        width, colour = terminal_width(sys.stdout)
-        print(run_text(run, folder, width=width, colour=colour), end="")
-    if result.stopped is not None:
-        kept = f" What was flown is in {folder}." if folder is not None else ""
-        if isinstance(result.stopped, KeyboardInterrupt):
-            return _tell(f"interrupted.{kept}", EXIT_INTERRUPTED)
-        return _tell(f"{result.stopped}.{kept}", getattr(result.stopped, "exit_status", EXIT_LINK))
+        try:
+            write_junit(run, args.junit)
+        except FroudeError as error:
+            stopped = stopped or error
+    if stopped is not None:
+        what, status = "interrupted", EXIT_INTERRUPTED
+        if not isinstance(stopped, KeyboardInterrupt):
+            what, status = str(stopped), getattr(stopped, "exit_status", EXIT_LINK)
+        kept = f"What was flown is in {folder}" if folder is not None else ""
+        return _tell(". ".join(part for part in (what, result.owed, kept) if part), status)
     if args.gate and any(flight.outcome is not Outcome.PASS for flight in run.flights):
         return EXIT_GATE
     return EXIT_OK
+
+
+def _show(text: str) -> None:
+    """Print a result; a reader that went away (froude fly | head) does not change the exit status."""
+    if sys.stdout is None:
+        return
+    try:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _mute_stdout()
+
+
+def _mute_stdout() -> None:
+    """Let Python's own flush at exit go nowhere instead of failing."""
+    import os
+
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, sys.stdout.fileno())
+    os.close(null)
 
 
 def _live_port() -> int:
@@ -240,7 +297,7 @@ def _live_port() -> int:
 
 def _progress_bar() -> AbstractContextManager[Callable[[Progress], object]]:
     """A bar on a terminal, nothing elsewhere."""
-    if not sys.stderr.isatty():
+    if sys.stderr is None or not sys.stderr.isatty():
         return nullcontext(lambda _: None)
     from scenarios.progress import progress_bar
 
@@ -266,7 +323,7 @@ def _sitl(args: argparse.Namespace) -> int:
     model = resolve_vehicle(args.spec, _words(args.scaling, DEFAULT_SCALING))
     vehicle = Vehicle(model, get_profile(args.profile or "sitl"), seed=args.seed)
     links = open_links(args.link or default_urls(args.instance), instance=args.instance)
-    terminal = sys.stderr.isatty()
+    terminal = sys.stderr is not None and sys.stderr.isatty()
     try:
         print(banner(model.name, links), flush=True)
         print("Ctrl-C stops it.", flush=True)

@@ -107,7 +107,8 @@ class FlightFiles:
             self._attempt(lambda: record.telemetry.to_parquet(self.path(".parquet"), about))
         for segment in record.segments:
             self._recorder.segment(segment)
-        self._attempt(lambda: self._recorder.close(flight_page(record), flight_properties(record)))
+        if self.problem is None:
+            self._attempt(lambda: self._recorder.close(flight_page(record), flight_properties(record)))
         self._attempt(self._finish_log)
 
     def _finish_log(self) -> None:

@@ -201,10 +201,10 @@ class _Flight:
                 if isinstance(error, PeerLost | PeerSilent):
                     break
         if trouble is not None:
-            self._log.notes.append(f"teardown incomplete: {trouble}")
             # a vehicle of our own that came to grief is thrown away; another is flown again, by somebody
             if not (self._job.in_memory and self._log.failure):
                 raise trouble
+            self._log.notes.append(f"teardown incomplete: {trouble}")
 
     def _open_client(self) -> Client:
         job = self._job

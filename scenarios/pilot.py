@@ -241,7 +241,7 @@ class Pilot:
         ended = ""
         try:
             while client.now_us() < end_us:
-                client.pump()
+                client.pump(end_us)
                 self._check()
         except FlightEndedError as end:
             ended = str(end)
@@ -268,10 +268,14 @@ class Pilot:
 
     # -- set-points and watching -------------------------------------------------------------------------------
 
-    def _stream(self, now_us: int) -> None:
-        """Send the set-point that is due: sample k of the manoeuvre from k periods after its start on, or level."""
+    def _stream(self, now_us: int) -> int:
+        """Send the set-point that is due: sample k of the manoeuvre from k periods after its start on, or level.
+
+        Returns:
+            vehicle time of the next one, us.
+        """
         if now_us < self._next_us:
-            return
+            return self._next_us
         elapsed = now_us - self._signal_start_us
         index = int(elapsed / self._period_us + EPSILON_S)
         phi_sp = float(self._signal[index]) if index < len(self._signal) else 0.0
@@ -279,6 +283,7 @@ class Pilot:
             self._signal_start_us + (index + 1) * self._period_us if len(self._signal) else now_us + self._period_us
         )
         self._client.attitude_setpoint(from_euler(phi_sp, 0.0, self._psi), self._thrust())
+        return self._next_us
 
     def _thrust(self) -> float:
         state = self._client.state

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import get_context
 from pathlib import Path
 
 from bridge.clock import utc_stamp
+from scenarios import interrupts
 from scenarios.flight import FlightRecord, RunRecord
 from scenarios.gain_set import GainSet, check, load_all
 from scenarios.one_flight import MEMORY, FlightJob, FlightStoppedError, fly
 from scenarios.run_folder import RunFolder, vehicle_description
 from scenarios.scenario import Scenario
 from sitl.airframe import FlightGains
-from sitl.errors import FroudeError, UsageError
+from sitl.errors import FroudeError, LinkError, UsageError
 from sitl.parameters import ParameterTable, ParameterType
 from sitl.profile import Profile
 from sitl.vehicle import airframe_parameters
@@ -35,6 +36,7 @@ class RunOptions:
     Attributes:
         out: folder that run folders are made in; None keeps nothing.
         connect: link URL of the vehicle, memory:// for our own.
+        arm_hardware: a serial link may be armed.
         jobs: flights at a time; more than one only for vehicles of our own.
         live_port: port that serves viewers while flying; None for none.
         command: as typed, for run.json.
@@ -42,9 +44,24 @@ class RunOptions:
 
     out: Path | None = Path("logs")
     connect: str = MEMORY
+    arm_hardware: bool = False
     jobs: int = 1
     live_port: int | None = None
     command: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for options that exclude each other, before anything is read."""
+        if self.connect.startswith("serial") and not self.arm_hardware:
+            raise UsageError(
+                f"--connect {self.connect}: a serial link leads to real hardware, and nothing is armed there without "
+                "--arm-hardware. Take the propellers off first"
+            )
+        if self.jobs < 1:
+            raise UsageError(f"--jobs {self.jobs}: give 1 or more")
+        if self.jobs > 1 and self.connect != MEMORY:
+            raise UsageError("--jobs above 1 needs vehicles of our own; leave out --connect or fly one at a time")
+        if self.jobs > 1 and self.live_port is not None:
+            raise UsageError("--live shows one flight at a time: leave out --jobs, or --live")
 
 
 @dataclass(frozen=True)
@@ -59,11 +76,28 @@ class Progress:
 
 @dataclass(frozen=True)
 class RunResult:
-    """A finished run: its record, its folder (None if nothing was kept), and what stopped it early, if anything."""
+    """A finished run.
+
+    Attributes:
+        run: its record.
+        folder: where it is kept; None if it is not.
+        stopped: what stopped it early, if anything did.
+        owed: what is left to do by hand on a vehicle that is not ours; empty if nothing.
+    """
 
     run: RunRecord
     folder: Path | None
     stopped: BaseException | None = None
+    owed: str = ""
+
+
+@dataclass
+class _Flown:
+    """What came back from the flights: record by job number, and what stopped them."""
+
+    records: dict[int, FlightRecord] = field(default_factory=dict)
+    stopped: BaseException | None = None
+    owed: str = ""
 
 
 def run_scenario(
@@ -85,15 +119,12 @@ def run_scenario(
     gain_sets = load_all(scenario.gain_sets)
     if not gain_sets:
         raise UsageError('no gain sets to fly: give --gains, for example "--gains table_7_2"')
-    if options.jobs < 1:
-        raise UsageError(f"--jobs {options.jobs}: give 1 or more")
-    if options.jobs > 1 and options.connect != MEMORY:
-        raise UsageError("--jobs above 1 needs vehicles of our own; leave out --connect or fly one at a time")
     candidates = [plan(gain_set, scenario, model, profile) for gain_set in gain_sets]
     baseline = _baseline(gain_sets, scenario, model, profile)
     folder = None
+    started_utc = utc_stamp()
     if options.out is not None:
-        folder = RunFolder.create(options.out, utc_stamp(), scenario.name, model.name)
+        folder = RunFolder.create(options.out, started_utc, scenario.name, model.name)
     jobs = [
         replace(
             job,
@@ -103,33 +134,34 @@ def run_scenario(
         )
         for job in (*candidates, *([baseline] if baseline else []))
     ]
-    flown, stopped = _fly_all(jobs, options.jobs, progress)
+    flown = _fly_all(jobs, options.jobs, progress)
+    records, stopped = flown.records, flown.stopped
     if stopped is not None:
-        flown = {index: record for index, record in flown.items() if len(record.telemetry)}
-        if not flown:
+        records = {index: record for index, record in records.items() if len(record.telemetry)}
+        if not records:
             # nothing was flown, so there is nothing to keep: a folder of empty files would only be in the way
             if folder is not None:
                 shutil.rmtree(folder.path, ignore_errors=True)
             raise stopped
-    own = flown.get(len(candidates)) if baseline else None
     run = RunRecord(
         scenario=scenario,
         vehicle=vehicle_description(model),
         profile=tuple(profile.describe()),
-        flights=tuple(flown[i] for i in sorted(flown) if i < len(candidates)),
-        baseline=own,
-        started_utc=utc_stamp(),
+        flights=tuple(records[i] for i in sorted(records) if i < len(candidates)),
+        baseline=records.get(len(candidates)),
+        started_utc=started_utc,
         versions=versions(),
         complete=stopped is None,
     )
     if folder is not None:
         progress(Progress(len(jobs), len(jobs), "run", "write"))
         try:
-            _write(run, folder, options)
-        except FroudeError as error:
+            with interrupts.held():
+                _write(run, folder, options)
+        except (FroudeError, KeyboardInterrupt) as error:
             # the flights themselves are on disk; the table is still worth printing
             stopped = stopped or error
-    return RunResult(run, folder.path if folder else None, stopped)
+    return RunResult(run, folder.path if folder else None, stopped, flown.owed)
 
 
 def _write(run: RunRecord, folder: RunFolder, options: RunOptions) -> None:
@@ -203,39 +235,60 @@ def _baseline(
     return plan(gain_set, scenario, model, profile)
 
 
-def _fly_all(
-    jobs: Sequence[FlightJob], workers: int, progress: Callable[[Progress], object]
-) -> tuple[dict[int, FlightRecord], BaseException | None]:
-    flown: dict[int, FlightRecord] = {}
-    if workers == 1 or len(jobs) == 1:
-        for index, job in enumerate(jobs):
-            name = job.gain_set.name
-            try:
-                flown[index] = fly(
-                    job,
-                    lambda phase, i=index, n=name: progress(Progress(i, len(jobs), n, phase)),  # type: ignore[misc]
-                )
-            except FlightStoppedError as stop:
-                flown[index] = stop.record
-                return flown, stop.cause
-        return flown, None
-    try:
-        for index, record in _pool(jobs, workers):
-            flown[index] = record
-            progress(Progress(len(flown) - 1, len(jobs), record.gain_set.name, "done"))
-    except FlightStoppedError as stop:
-        return flown, stop.cause
-    except KeyboardInterrupt as stop_:
-        return flown, stop_
-    return flown, None
+def _fly_all(jobs: Sequence[FlightJob], workers: int, progress: Callable[[Progress], object]) -> _Flown:
+    if workers > 1 and len(jobs) > 1:
+        return _fly_side_by_side(jobs, workers, progress)
+    flown = _Flown()
+    for index, job in enumerate(jobs):
+        name = job.gain_set.name
+        try:
+            flown.records[index] = fly(
+                job,
+                lambda phase, i=index, n=name: progress(Progress(i, len(jobs), n, phase)),  # type: ignore[misc]
+            )
+        except FlightStoppedError as stop:
+            flown.records[index] = stop.record
+            flown.stopped, flown.owed = stop.cause, stop.owed
+            break
+        except KeyboardInterrupt as stop_:
+            flown.stopped = stop_
+            break
+    return flown
 
 
-def _pool(jobs: Sequence[FlightJob], workers: int) -> Iterator[tuple[int, FlightRecord]]:
+def _fly_side_by_side(jobs: Sequence[FlightJob], workers: int, progress: Callable[[Progress], object]) -> _Flown:
+    """In processes of their own; when something stops the run, flights that have begun are flown to their end."""
+    flown = _Flown()
     # spawn: a forked child of a process that has started Arrow's or Rerun's threads may hang
-    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn")) as pool:
-        waiting = {pool.submit(fly, job): index for index, job in enumerate(jobs)}
-        for done in as_completed(waiting):
-            yield waiting[done], done.result()
+    pool = ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn"))
+    flights: dict[Future[FlightRecord], int] = {}
+    try:
+        with interrupts.kept_from_children():
+            flights = {pool.submit(fly, job): index for index, job in enumerate(jobs)}
+        for number, done in enumerate(as_completed(flights)):
+            _collect(done, flights[done], flown)
+            if flown.stopped is not None:
+                break
+            progress(Progress(number, len(jobs), jobs[flights[done]].gain_set.name, "done"))
+    except KeyboardInterrupt as stop:
+        flown.stopped = stop
+    with interrupts.held():
+        pool.shutdown(wait=True, cancel_futures=True)
+        for flight, index in flights.items():
+            if not flight.cancelled() and index not in flown.records:
+                _collect(flight, index, flown)
+    return flown
+
+
+def _collect(flight: Future[FlightRecord], index: int, flown: _Flown) -> None:
+    try:
+        flown.records[index] = flight.result()
+    except FlightStoppedError as stop:
+        flown.records[index] = stop.record
+        flown.stopped = flown.stopped or stop.cause
+    except BrokenProcessPool:
+        problem = "a process that flew was killed: out of memory? Fly one at a time, without --jobs"
+        flown.stopped = flown.stopped or LinkError(problem)
 
 
 def versions() -> dict[str, str]:
@@ -249,8 +302,3 @@ def _version(name: str) -> str:
         return version(name)
     except PackageNotFoundError:
         return "unknown"
-
-
-def default_jobs() -> int:
-    """Flights at a time when nobody asks: one, so that a run is as quick as it is quiet."""
-    return max(1, int(os.environ.get("FROUDE_JOBS", "1")))

@@ -22,6 +22,9 @@ from sitl.rotation import normalise, to_euler
 HISTORY = 8
 """Attitudes remembered, hence the greatest lateness of the estimate in ticks is HISTORY - 2."""
 
+_ABSURD = 1e6
+"""Bound of rate set-points (rad/s) and motors where there are no limits: what diverges must still be told."""
+
 OFF, RATES, ATTITUDE = 0, 1, 2
 """What the loop controls: nothing (motors stopped), body rates, attitude."""
 
@@ -174,7 +177,7 @@ def _attitude_law(settings: Record, request: Record, state: Record) -> None:
         rate_max = (settings.rate_max[0], settings.rate_max[1], settings.rate_max[2])
         wanted = attitude_control(quat, quat_sp, gain, settings.yaw_weight, rate_max, request.yaw_rate_sp)
     for axis in range(3):
-        state.rates_sp[axis] = wanted[axis]
+        state.rates_sp[axis] = constrain(wanted[axis], -_ABSURD, _ABSURD)
 
 
 @compiled
@@ -220,6 +223,7 @@ def _allocation(settings: Record, request: Record, state: Record) -> None:
     if not settings.limits:
         allocate(settings.mix, n, state.torque_sp, request.thrust_sp, 0, 0, state.motors)
         for i in range(n):
+            state.motors[i] = constrain(state.motors[i], -_ABSURD, _ABSURD)
             state.outputs[i] = state.motors[i] if math.isfinite(state.motors[i]) else 0.0
         return
     wanted = np.empty(MAX_MOTORS)

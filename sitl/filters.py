@@ -99,6 +99,7 @@ def settle_biquad(coefficients: NDArray[np.float64], delay: NDArray[np.float64],
         delay: (2,) the filter's memory, overwritten.
         sample: the constant input.
     """
-    w = sample / (1.0 + coefficients[3] + coefficients[4])
+    total = 1.0 + coefficients[3] + coefficients[4]
+    w = sample / total if total > 0.0 else 0.0  # zero by rounding for cutoffs far below any use
     delay[0] = w
     delay[1] = w

@@ -32,6 +32,8 @@ G_M_S2 = 9.81
 """Gravity that reproduces table 3.1 of the study to its printed digits, m/s^2."""
 
 MAX_STEP_S = 1e-3
+LOST_M, LOST_M_S, LOST_RAD_S = 1e5, 300.0, 1e4
+"""Beyond these (position, speed, body rate) the model means nothing any more: see ``Plant.lost``."""
 MAX_DELAY_TICKS = 64
 
 PLANT_SETTINGS = np.dtype(
@@ -68,6 +70,7 @@ PLANT_STATE = np.dtype(
         ("quat", "f8", (4,)),
         ("velocity", "f8", (3,)),
         ("contact", "?"),
+        ("lost", "?"),
     ],
     align=True,
 )
@@ -168,6 +171,15 @@ def _step(s: Record, state: Record, start: Floats, middle: Floats, end: Floats, 
 
 
 @compiled
+def _makes_sense(x: Floats) -> bool:
+    good = True
+    for i in range(3):
+        # NaN makes no sense either: it is below nothing
+        good = good and abs(x[i]) < LOST_M and abs(x[3 + i]) < LOST_M_S and abs(x[10 + i]) < LOST_RAD_S
+    return good
+
+
+@compiled
 def plant_tick(settings_array: NDArray[np.void], state_array: NDArray[np.void], commands: Floats) -> None:
     """Move the plant by one tick with the motors commanded at its start (after the transport delay).
 
@@ -178,6 +190,8 @@ def plant_tick(settings_array: NDArray[np.void], state_array: NDArray[np.void], 
     """
     s: Record = settings_array[0]
     state: Record = state_array[0]
+    if state.lost:
+        return
     for i in range(MAX_MOTORS):
         for k in range(s.delay_ticks, 0, -1):
             state.queue[k, i] = state.queue[k - 1, i]
@@ -186,6 +200,7 @@ def plant_tick(settings_array: NDArray[np.void], state_array: NDArray[np.void], 
     half = math.exp(-0.5 * s.step_s / s.motor_lag_s) if s.motor_lag_s > 0.0 else 0.0
     motors = np.empty(MAX_MOTORS)
     start, middle, end = np.empty(4), np.empty(4), np.empty(4)
+    before = state.x.copy()
     for i in range(3):
         state.force[i] = 0.0
     for i in range(MAX_MOTORS):
@@ -203,6 +218,17 @@ def plant_tick(settings_array: NDArray[np.void], state_array: NDArray[np.void], 
         for i in range(4):
             start[i] = end[i]
     x = state.x
+    if not _makes_sense(x):
+        state.lost = True
+        for i in range(13):
+            x[i] = before[i] if i < 3 else 0.0
+        x[6 if s.linear else 7] = math.pi if s.linear else 1.0
+        for i in range(MAX_MOTORS):
+            state.motors[i] = 0.0
+        for i in range(4):
+            end[i] = 0.0
+        for i in range(3):
+            state.force[i] = G_M_S2 if i == 2 else 0.0
     if s.linear:
         quat = from_euler(x[6], x[7], x[8])
         for i in range(4):
@@ -276,6 +302,11 @@ class Plant:
         if not linear:
             self.x[6] = 1.0
         self.force[2] = -G_M_S2
+
+    @property
+    def lost(self) -> bool:
+        """The motion diverged out of all sense, as a loop without limits can. It lies still then, upside down."""
+        return bool(self.state["lost"][0])
 
     def step(self, commands: Floats) -> None:
         """Move by one tick.

@@ -137,7 +137,7 @@ def position_tick(
         state.vel_sp[i] = wanted
     state.started = True
     speed = math.sqrt(state.vel_sp[0] ** 2 + state.vel_sp[1] ** 2)
-    if speed > s.vel_xy_max:
+    if speed > max(0.0, s.vel_xy_max):
         state.vel_sp[0] *= s.vel_xy_max / speed
         state.vel_sp[1] *= s.vel_xy_max / speed
     if math.isfinite(request.position_sp[2]):

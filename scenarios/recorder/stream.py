@@ -26,6 +26,8 @@ TIMELINE = "flight_time"
 """The viewer follows one timeline in all views, so flights and comparisons call theirs the same."""
 
 LEAST_FREE_BYTES = 16_000_000
+LEAST_LEFT_BYTES = 100_000
+FLUSH_PATIENCE_S = 30.0
 LIVE_PATIENCE_S = 2.0
 _FOOTER = b"FOOT"
 """Ends the last bytes of a file that was finished."""
@@ -173,7 +175,9 @@ class Recording:
             FileError: not everything could be written; the partial file stays.
         """
         try:
-            self._file.flush()
+            # Rerun's writer dies of a full disk without a word, and a flush that it no longer answers waits for ever.
+            _check_space(self.path, LEAST_LEFT_BYTES)
+            self._file.flush(timeout_sec=FLUSH_PATIENCE_S)
             self._file.disconnect()
             with self.partial.open("rb") as file:
                 file.seek(-64, 2)
@@ -181,10 +185,12 @@ class Recording:
             if not whole:
                 raise RuntimeError("the file has no end")
             self.partial.replace(self.path)
-        except (RuntimeError, OSError) as error:
+        except (RuntimeError, OSError, FileError) as error:
+            self._file.disconnect()
+            problem = error.problem if isinstance(error, FileError) else error
             raise FileError(
                 self.path,
-                f"could not be finished: {error}",
+                f"could not be finished: {problem}",
                 f"Free some space; what was flown is in {self.partial}",
             ) from error
         finally:
@@ -205,14 +211,14 @@ class Recording:
             self._live = None
 
 
-def _check_space(path: Path) -> None:
+def _check_space(path: Path, least_bytes: int = LEAST_FREE_BYTES) -> None:
     import shutil
 
     try:
         free = shutil.disk_usage(path.parent).free
     except OSError as error:
         raise FileError(path, f"cannot be written: {error}", "Choose another folder with --out") from error
-    if free < LEAST_FREE_BYTES:
+    if free < least_bytes:
         raise FileError(
             path,
             f"cannot be written: {free / 1e6:.1f} MB are free on its disk",

@@ -83,7 +83,7 @@ def test_codec(name: str) -> None:
         lambda: getattr(reader.receive(frame)[0], field),
         lambda: getattr(mav.parse_buffer(frame)[0], field),
     )
-    print(  # noqa: T201
+    print(
         f"\n{name}: write {write / 1e3:.0f} k/s ({write / their_write:.1f} x pymavlink), "
         f"read {read / 1e3:.0f} k/s ({read / their_read:.1f} x)"
     )

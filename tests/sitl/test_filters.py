@@ -115,6 +115,12 @@ def test_a_settled_filter_goes_on_as_if_its_input_had_always_been_there(
     assert [biquad(table, delay, level) for _ in range(5)] == pytest.approx([level] * 5, abs=1e-9)
 
 
+def test_a_cutoff_too_low_to_compute_with_still_settles() -> None:
+    table, delay = np.array(low_pass_2p(1e-30, 250.0)), np.zeros(2)
+    settle_biquad(table, delay, 3.0)
+    assert np.isfinite(delay).all()
+
+
 @pytest.mark.parametrize(
     ("value", "expected"), [(0.3, 0.3), (2.0, 1.0), (-2.0, -1.0), (math.inf, 1.0), (-math.inf, -1.0)]
 )

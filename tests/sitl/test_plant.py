@@ -340,6 +340,32 @@ class TestGround:
         assert rig.plant.velocity_ned() == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
 
 
+class TestLost:
+    @pytest.mark.parametrize("linear", [True, False])
+    @pytest.mark.parametrize("torque", [1e30, -1e6, math.inf, math.nan])
+    def test_motion_without_sense_ends_upside_down_and_finite(self, linear: bool, torque: float) -> None:
+        rig = Rig(linear=linear, height_m=20.0, lag_s=0.025)
+        rig.step()
+        motors = np.full(MAX_MOTORS, torque)
+        motors[0] = 0.5
+        for _ in range(200):
+            rig.plant.step(motors)
+        assert rig.plant.lost
+        assert abs(rig.plant.euler()[0]) == pytest.approx(math.pi)
+        assert rig.plant.velocity_ned() == (0.0, 0.0, 0.0)
+        assert rig.plant.rates.tolist() == [0.0, 0.0, 0.0]
+        assert np.isfinite(rig.plant.x).all()
+        assert np.isfinite(rig.plant.quat).all()
+        assert np.isfinite(rig.plant.force).all()
+        assert np.isfinite(rig.plant.delta).all()
+
+    def test_anything_that_flies_is_not(self) -> None:
+        rig = Rig(height_m=5000.0)
+        for k in range(2000):
+            rig.step(0.7 if k % 50 < 25 else -0.7, 0.7, 0.3, thrust=0.0)
+        assert not rig.plant.lost
+
+
 def test_same_commands_same_bytes() -> None:
     states = []
     for _ in range(2):

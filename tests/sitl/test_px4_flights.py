@@ -175,3 +175,49 @@ def test_timing_is_what_makes_them_agree(flight: Any, name: str) -> None:
     shifted = np.concatenate([[ours[0]], ours[:-1]])
     right, late = (float(np.sqrt(np.mean((x - x[0] - roll + roll[0]) ** 2))) for x in (ours, shifted))
     assert right < late
+
+
+# What the real PX4 did in Hold with these gains on roll: rate standard deviation (rad/s) and frequency (Hz). The side
+# force of the motors comes back through the velocity controller, so these are cycles that Offboard does not have.
+ADAM_ON_ANT_X = FlightGains(13.88, 0.604, 3.09, 1.44e-5)
+ADAM_ON_ADAM = FlightGains(10.68, 1.07, 47.1, 4.43e-5)
+ANT_X_ON_ANT_R = FlightGains(11.81, 0.123, 3.2, 4.99e-7)
+ANT_X_ON_ANT_X = FlightGains(12.04, 0.6, 35.8, 3.57e-6)
+ANT_X_ON_CARRIER = FlightGains(12.49, 0.341, 2.21, 1.64e-5)
+HOLD = [
+    ("adam-0", ADAM_ON_ANT_X, 0.0, 0.62, 22.5),
+    ("adam-0", ADAM_ON_ANT_X, 0.010, 1.02, 13.3),
+    ("adam-0", ADAM_ON_ADAM, 0.0, 0.87, 20.8),
+    ("adam-0", ADAM_ON_ADAM, 0.010, 1.14, 12.7),
+    ("adam-0", ADAM_ON_ADAM, 0.025, 1.36, 8.3),
+    ("ant-x", ANT_X_ON_ANT_R, 0.025, 4.96, 5.7),
+    ("ant-x", ANT_X_ON_ANT_X, 0.0, 1.42, 29.9),
+    ("ant-x", ANT_X_ON_ANT_X, 0.010, 2.37, 14.0),
+    ("ant-x", ANT_X_ON_ANT_X, 0.025, 4.30, 7.0),
+    ("ant-x", ANT_X_ON_CARRIER, 0.025, 3.23, 8.2),
+]
+
+
+def hold(flight: Any, airframe: str, gains: FlightGains, lag_s: float, **parameters: float) -> np.ndarray:
+    """Roll rate over four seconds of Hold."""
+    made = flight(airframe, motor_lag_s=lag_s)
+    made.set_gains("ROLL", gains.k_phi, gains.kp, gains.ki, gains.kd)
+    for name, value in parameters.items():
+        made.parameters.set(name, value)
+    made.take_off(10.0, settle_s=6.0)
+    rates: list[float] = []
+    made.run(4.0, lambda _: rates.append(made.vehicle.truth.rates()[0]))
+    return np.array(rates)
+
+
+@pytest.mark.parametrize(("airframe", "gains", "lag_s", "std_rad_s", "cycle_hz"), HOLD)
+def test_hold_cycles_as_it_did(
+    flight: Any, airframe: str, gains: FlightGains, lag_s: float, std_rad_s: float, cycle_hz: float
+) -> None:
+    rate = hold(flight, airframe, gains, lag_s)
+    assert rate.std() == pytest.approx(std_rad_s, rel=0.25)
+    assert frequency_hz(rate) == pytest.approx(cycle_hz, abs=2.0)
+
+
+def test_hold_is_quiet_once_the_velocity_controller_has_no_derivative(flight: Any) -> None:
+    assert hold(flight, "adam-0", ADAM_ON_ANT_X, 0.0, MPC_XY_VEL_D_ACC=0.0).std() < 0.02
