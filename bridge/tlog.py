@@ -73,10 +73,16 @@ class TlogWriter:
         """Write what waits and release the file; may be repeated."""
         if self._file.closed:
             return
-        self.flush()
+        try:
+            self.flush()
+        finally:
+            self._release()
+
+    def _release(self) -> None:
         try:
             self._file.close()
         except OSError as error:
+            self._file.raw.close()  # a full disk fails the flush, and the file would stay open
             raise self._unwritable(error) from None
 
     def __enter__(self) -> Self:

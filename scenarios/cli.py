@@ -242,13 +242,14 @@ def _report(args: argparse.Namespace, result: RunResult) -> int:
     from scenarios.table import run_text, terminal_width
     from sitl.errors import FroudeError
 
-    run, folder, stopped = result.run, result.folder, result.stopped
+    run, folder = result.run, result.folder
     if args.json:
         shown = run_object(run, RunFolder(folder) if folder else None, ("froude", *args.argv))
-        _show(json.dumps(shown, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+        text = json.dumps(shown, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     else:
         width, colour = terminal_width(sys.stdout)
-        _show(run_text(run, folder, width=width, colour=colour))
+        text = run_text(run, folder, width=width, colour=colour)
+    stopped = result.stopped or _show(text)
     if args.junit is not None:
         from scenarios.junit import write_junit
 
@@ -267,15 +268,20 @@ def _report(args: argparse.Namespace, result: RunResult) -> int:
     return EXIT_OK
 
 
-def _show(text: str) -> None:
-    """Print a result; a reader that went away (froude fly | head) does not change the exit status."""
-    if sys.stdout is None:
-        return
+def _show(text: str) -> Exception | None:
+    """Print a result; what went wrong, but a reader that went away (froude fly | head) is no trouble."""
+    from sitl.errors import FileError
+
     try:
-        sys.stdout.write(text)
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.write(text)
+            sys.stdout.flush()
     except BrokenPipeError:
         _mute_stdout()
+    except OSError as error:
+        _mute_stdout()
+        return FileError("standard output", f"cannot be written: {error.strerror}", "The result is in run.json")
+    return None
 
 
 def _mute_stdout() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.resources
 import math
 import re
+import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,8 @@ SET_KEYS = ("name", "source", "note", "parameters")
 
 GAIN = re.compile(r"MC_(ROLL|PITCH|YAW)(RATE)?_(P|I|D|FF|K)$")
 """Parameters that are gains: a negative one is positive feedback, never a candidate."""
+
+_SLUG_LENGTH = 80
 
 ABSURD_FACTOR = 100.0  # times PX4's maximum: a slipped decimal point or a wrong unit, not a candidate
 ABSURD = 1e3  # for gains whose metadata states no maximum
@@ -58,8 +61,14 @@ class GainSet:
 
     @property
     def slug(self) -> str:
-        """The name as a file name: lower case letters, digits, `_` and `-`."""
-        return re.sub(r"[^a-z0-9-]+", "_", self.name.lower()).strip("_")[:80] or "set"
+        """The name as a file name: lower case letters, digits, `_` and `-`.
+
+        A name that this would rob of letters, or that is too long, gets its checksum at the end.
+        """
+        text = re.sub(r"[^a-z0-9-]+", "_", self.name.lower()).strip("_")
+        if text and len(text) <= _SLUG_LENGTH and self.name.isascii():
+            return text
+        return f"{text[: _SLUG_LENGTH - 9] or 'set'}_{zlib.crc32(self.name.encode(errors='surrogatepass')):08x}"
 
     def mirrored(self) -> GainSet:
         """The same gains on pitch as well, but for pitch parameters that the set states itself."""
@@ -111,7 +120,8 @@ def load_all(refs: Iterable[str | Path]) -> tuple[GainSet, ...]:
         if other is not gain_set:
             raise FileError(
                 gain_set.path or "gain sets",
-                f"gain set {gain_set.name!r} has the same name as {other.name!r} of {other.path}",
+                f"gain set {gain_set.name!r} has the same name as {other.name!r} of {other.path}, "
+                f"or the same file name, {gain_set.slug}",
                 "Name it once, or rename one: results and files are told apart by it",
             )
     return sets
@@ -128,7 +138,7 @@ def check(gain_set: GainSet, table: ParameterTable) -> list[str]:
         so large
             that it must be a slip (over 100 times PX4's maximum; over 1000 where it states none).
     """
-    from sitl.parameters import range_problem, to_raw
+    from sitl.parameters import from_raw, range_problem, to_raw
 
     warnings = []
     for name, value in gain_set.parameters.items():
@@ -139,12 +149,12 @@ def check(gain_set: GainSet, table: ParameterTable) -> list[str]:
         if not math.isfinite(value):
             raise _bad(gain_set, f"{name} = {value} is not a finite number", "Write a number")
         try:
-            to_raw(name, spec.type, value)
+            stored = from_raw(spec.type, to_raw(name, spec.type, value))
         except UsageError as error:
             raise _bad(gain_set, str(error), "Correct the value") from error
         if GAIN.match(name):
             _check_gain(gain_set, name, value, spec.maximum)
-        outside = range_problem(spec, value)
+        outside = range_problem(spec, stored)
         if outside:
             warnings.append(f"{outside}; flown anyway")
     return warnings
@@ -190,9 +200,12 @@ def save_params(
         integer = table.spec(name).type == "INT32" if table is not None and known else isinstance(value, int)
         text = str(int(value)) if integer else str(np.float32(value))
         lines.append(f"{sysid}\t{compid}\t{name}\t{text}\t{6 if integer else 9}")
+    part = Path(path).with_name(Path(path).name + ".part")
     try:
-        Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        part.replace(path)
     except OSError as error:
+        part.unlink(missing_ok=True)
         raise FileError(path, f"cannot be written: {error.strerror}", "Choose another place") from error
 
 
@@ -233,7 +246,8 @@ def _from_toml(path: Path) -> tuple[GainSet, ...]:
     slugs = [gain_set.slug for gain_set in sets]
     for gain_set in sets:
         if slugs.count(gain_set.slug) > 1:
-            raise FileError(path, f"two gain sets are named {gain_set.name!r}", "Rename one")
+            problem = f"two gain sets are named {gain_set.name!r}, or have the same file name, {gain_set.slug}"
+            raise FileError(path, problem, "Rename one")
     return sets
 
 

@@ -1,4 +1,4 @@
-"""Ctrl-C and its relatives: stop at once, but never in the middle of writing what was flown."""
+"""Ctrl-C and its relatives: stop soon, but land first, and never in the middle of writing what was flown."""
 
 from __future__ import annotations
 
@@ -12,9 +12,13 @@ STOPPING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP
 """What asks a program to stop; a vehicle in the air is landed first, whichever it is."""
 
 
-class _Hold:
-    depth = 0
-    pending = False
+class _Signals:
+    """Of this process: `heard` so far, how many blocks of each kind we are in, and whether one waits for their end."""
+
+    heard = 0
+    holding = 0
+    landing = 0
+    waiting = False
 
 
 @contextmanager
@@ -27,18 +31,17 @@ def caught(first: Callable[[], object] = lambda: None) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    heard = False
 
     def stop(_number: int, _frame: FrameType | None) -> None:
-        nonlocal heard
-        if not heard:
-            heard = True
+        _Signals.heard += 1
+        if _Signals.heard == 1:
             first()
-        if _Hold.depth:
-            _Hold.pending = True
+        if _Signals.holding or (_Signals.landing and _Signals.heard == 1):
+            _Signals.waiting = True
         else:
             raise KeyboardInterrupt
 
+    _Signals.heard, _Signals.waiting = 0, False
     before = {number: signal.signal(number, stop) for number in STOPPING}
     try:
         yield
@@ -49,15 +52,29 @@ def caught(first: Callable[[], object] = lambda: None) -> Iterator[None]:
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Keep a signal that comes meanwhile until the end of this block."""
-    _Hold.depth += 1
+    """Keep signals until the end of this block: what it writes is worth the moment it takes.
+
+    Raises:
+        KeyboardInterrupt: at the end, for a signal that came in it or in a `landing` before.
+    """
+    _Signals.holding += 1
     try:
         yield
     finally:
-        _Hold.depth -= 1
-    if _Hold.pending and not _Hold.depth:
-        _Hold.pending = False
+        _Signals.holding -= 1
+    if _Signals.waiting and not _Signals.holding:
+        _Signals.waiting = False
         raise KeyboardInterrupt
+
+
+@contextmanager
+def landing() -> Iterator[None]:
+    """Keep the first signal until the next `held` has ended; a second one breaks off at once."""
+    _Signals.landing += 1
+    try:
+        yield
+    finally:
+        _Signals.landing -= 1
 
 
 @contextmanager

@@ -62,6 +62,37 @@ METRICS: Mapping[str, tuple[str, str]] = {
 }
 
 
+TITLES: Mapping[str, str] = {
+    "overshoot_pct": "overshoot",
+    "rise_time_s": "rise time",
+    "settling_time_5pct_s": "settling time (5 %)",
+    "settling_time_2pct_s": "settling time (2 %)",
+    "droop_deg": "droop",
+    "peak_delta_lat": "peak delta_lat",
+    "rms_delta_lat": "RMS delta_lat",
+    "oscillation_rad_s": "oscillation",
+    "oscillation_hz": "oscillation frequency",
+    "p_std_rad_s": "roll rate deviation",
+    "q_std_rad_s": "pitch rate deviation",
+    "r_std_rad_s": "yaw rate deviation",
+    "vaf_pct": "VAF",
+    "lag_s": "lag",
+    "vaf_lag_removed_pct": "VAF without lag",
+    "rms_error_deg": "RMS error",
+    "gain_margin_low_db": "lower gain margin",
+    "gain_margin_high_db": "upper gain margin",
+    "phase_margin_deg": "phase margin",
+    "delay_margin_s": "delay margin",
+    "modulus_margin": "modulus margin",
+    "attitude_rate_hz": "ATTITUDE rate",
+    "largest_gap_s": "largest gap",
+}
+"""What a metric is called in sentences."""
+
+MILLISECONDS = ("delay_margin_s", "lag_s", "largest_gap_s")
+"""Metrics that sentences give in ms."""
+
+
 @dataclass(frozen=True)
 class Metric:
     """One measurement.
@@ -102,14 +133,16 @@ class Limit:
     maximum: float | None = None
 
     def __str__(self) -> str:
-        unit = METRICS[self.metric][0]
+        return self._text(METRICS[self.metric][0], 1.0)
+
+    def for_people(self) -> str:
+        """As the metric's value is given in sentences."""
+        return self._text(*_shown(self.metric))
+
+    def _text(self, unit: str, factor: float) -> str:
         suffix = "" if unit == "1" else f" {unit}"
-        parts = []
-        if self.minimum is not None:
-            parts.append(f">= {self.minimum:g}{suffix}")
-        if self.maximum is not None:
-            parts.append(f"<= {self.maximum:g}{suffix}")
-        return " and ".join(parts)
+        bounds = ((">=", self.minimum), ("<=", self.maximum))
+        return " and ".join(f"{sign} {bound * factor:g}{suffix}" for sign, bound in bounds if bound is not None)
 
     def holds(self, value: float) -> bool:
         """Is the value inside?"""
@@ -212,8 +245,8 @@ def judge(
 
     complete = [checked.get(m.name, m) if not m.segment else m for m in metrics]
     complete += [metric for name, metric in checked.items() if name not in by_name]
-    failed = [_failed(m) for m in checked.values() if m.outcome is Outcome.FAIL]
-    unset = [f"{m.name} unset: {m.reason}" for m in checked.values() if m.outcome is Outcome.UNSET]
+    failed = [_failed(m, applied[m.name]) for m in checked.values() if m.outcome is Outcome.FAIL]
+    unset = [f"{TITLES[m.name]} unset: {m.reason}" for m in checked.values() if m.outcome is Outcome.UNSET]
     if failure or failed:
         return Outcome.FAIL, "; ".join(([failure] if failure else []) + failed), tuple(complete)
     if not limits:
@@ -223,10 +256,16 @@ def judge(
     return Outcome.PASS, "", tuple(complete)
 
 
-def _failed(metric: Metric) -> str:
+def _failed(metric: Metric, limit: Limit) -> str:
     if metric.name == STANDING.metric and metric.reason:
         return metric.reason
     assert metric.value is not None
-    unit = "" if metric.unit == "1" else f" {metric.unit}"
-    text = f"{metric.name} {metric.value:.3g}{unit}, limit {metric.limit}"
+    unit, factor = _shown(metric.name)
+    value = f"{metric.value * factor:.3g}" + ("" if unit == "1" else f" {unit}")
+    text = f"{TITLES[metric.name]} {value}, limit {limit.for_people()}"
     return text + (f" ({metric.reason})" if metric.reason else "")
+
+
+def _shown(name: str) -> tuple[str, float]:
+    """Unit of a metric in sentences, and the factor to it from the metric's own."""
+    return ("ms", 1000.0) if name in MILLISECONDS else (METRICS[name][0], 1.0)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -118,14 +118,17 @@ def fly(job: FlightJob, progress: Callable[[str], object] = lambda _: None) -> F
     try:
         flight.run()
     except (FroudeError, KeyboardInterrupt) as cause:
-        with interrupts.held():
+        with suppress(KeyboardInterrupt), interrupts.held():
             record = flight.finish(stopped=cause)
         raise FlightStoppedError(record, cause, flight.owed) from cause
     except BaseException:
         flight.close()
         raise
-    with interrupts.held():
-        record = flight.finish()
+    try:
+        with interrupts.held():
+            record = flight.finish()
+    except KeyboardInterrupt as late:
+        raise FlightStoppedError(record, late) from late
     if flight.problem is not None:
         raise FlightStoppedError(record, flight.problem)
     return record
@@ -183,7 +186,8 @@ class _Flight:
             self._upload(client)
             pilot.fly()
         finally:
-            self._tear_down(client, pilot)
+            with interrupts.landing():
+                self._tear_down(client, pilot)
 
     def _tear_down(self, client: Client, pilot: Pilot) -> None:
         """Land, restore, leave the streams as they were: each is tried even if the one before failed."""

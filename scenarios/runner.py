@@ -149,7 +149,7 @@ def run_scenario(
         profile=tuple(profile.describe()),
         flights=tuple(records[i] for i in sorted(records) if i < len(candidates)),
         baseline=records.get(len(candidates)),
-        started_utc=started_utc,
+        started_utc=_extended(started_utc),
         versions=versions(),
         complete=stopped is None,
     )
@@ -226,12 +226,9 @@ def _baseline(
 
     if any(flies_own(gain_set) for gain_set in gain_sets):
         return None
-    gain_set = GainSet(
-        name=f"own {model.airframe.name}",
-        parameters=wanted,
-        source="the airframe's own flight gains",
-        note="baseline",
-    )
+    gain_set = GainSet(f"own {model.airframe.name}", wanted, "the airframe's own flight gains", "baseline")
+    while gain_set.slug in {other.slug for other in gain_sets}:  # a candidate's files must stay the candidate's
+        gain_set = replace(gain_set, name=f"{gain_set.name} baseline")
     return plan(gain_set, scenario, model, profile)
 
 
@@ -272,11 +269,14 @@ def _fly_side_by_side(jobs: Sequence[FlightJob], workers: int, progress: Callabl
             progress(Progress(number, len(jobs), jobs[flights[done]].gain_set.name, "done"))
     except KeyboardInterrupt as stop:
         flown.stopped = stop
-    with interrupts.held():
-        pool.shutdown(wait=True, cancel_futures=True)
-        for flight, index in flights.items():
-            if not flight.cancelled() and index not in flown.records:
-                _collect(flight, index, flown)
+    try:
+        with interrupts.held():
+            pool.shutdown(wait=True, cancel_futures=True)
+            for flight, index in flights.items():
+                if not flight.cancelled() and index not in flown.records:
+                    _collect(flight, index, flown)
+    except KeyboardInterrupt as stop:
+        flown.stopped = flown.stopped or stop
     return flown
 
 
@@ -289,6 +289,12 @@ def _collect(flight: Future[FlightRecord], index: int, flown: _Flown) -> None:
     except BrokenProcessPool:
         problem = "a process that flew was killed: out of memory? Fly one at a time, without --jobs"
         flown.stopped = flown.stopped or LinkError(problem)
+
+
+def _extended(stamp: str) -> str:
+    """ISO 8601 with its separators, as JUnit's readers want it, of a file name's `20261122T200455Z`."""
+    day, clock = stamp.rstrip("Z").split("T")
+    return f"{day[:4]}-{day[4:6]}-{day[6:]}T{clock[:2]}:{clock[2:4]}:{clock[4:]}Z"
 
 
 def versions() -> dict[str, str]:

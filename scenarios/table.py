@@ -143,13 +143,16 @@ def own_flight(run: RunRecord) -> FlightRecord | None:
     return None
 
 
-def own_gains_fly(flight: FlightRecord) -> bool:
+def own_gains_fly(flight: FlightRecord) -> bool | None:
     """Did this flight, of the airframe's own gains, fly: nothing went wrong and nothing oscillates?
 
-    The scenario's other limits are for candidates; gains that flew may well be slow.
+    The scenario's other limits are for candidates; gains that flew may well be slow. None: it was broken off, or too
+    short to tell.
     """
+    if flight.outcome is Outcome.UNSET:
+        return True if _quiet(flight) else None
     if flight.outcome is not Outcome.FAIL:
-        return flight.outcome is not Outcome.UNSET or _quiet(flight)
+        return True
     return _quiet(flight) and any(metric.outcome is Outcome.FAIL for metric in flight.metrics)
 
 
@@ -167,7 +170,10 @@ def own_gains_line(run: RunRecord) -> str:
     if flight is None:
         return ""
     name = flight.gain_set.name
-    if own_gains_fly(flight):
+    fly = own_gains_fly(flight)
+    if fly is None:
+        return f"Whether the airframe's own flight gains ({name}) fly here is not known: {flight.reason}."
+    if fly:
         verdict = "" if not flight.reason else f" ({flight.outcome} here: {flight.reason})"
         return f"The airframe's own flight gains ({name}) fly under these assumptions{verdict}."
     return (

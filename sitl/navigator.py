@@ -12,7 +12,7 @@ from enum import Enum
 import numpy as np
 
 from sitl.filters import constrain
-from sitl.modes import Mode
+from sitl.modes import Mode, Severity, Text
 from sitl.parameters import ParameterTable
 from sitl.position_control import POSITION_INPUT
 
@@ -39,7 +39,12 @@ class Navigator:
     def __init__(self, parameters: ParameterTable) -> None:
         self._parameters = parameters
         self.request = np.zeros(1, POSITION_INPUT)
-        self.request["idle"] = True
+        # views: writing through them costs a tenth of writing a field of a structured array
+        self._idle = self.request["idle"]
+        self._yaw_sp = self.request["yaw_sp"]
+        self._position_sp = self.request["position_sp"][0]
+        self._velocity_sp = self.request["velocity_sp"][0]
+        self._idle[0] = True
         self.state = TakeoffState.DISARMED
         self.hold_ned = [0.0, 0.0, 0.0]
         self.yaw = 0.0
@@ -82,6 +87,26 @@ class Navigator:
         self._climb = velocity[2]
         self.descending = self.state not in (TakeoffState.RAMPUP, TakeoffState.FLIGHT)
 
+    def aim(self, target_down: float | None) -> list[Text]:
+        """Choose the height of a take-off that begins where this navigator was entered.
+
+        Args:
+            target_down: wanted height in the local frame, m (down); None or not finite for MIS_TAKEOFF_ALT above here.
+
+        Returns:
+            texts to say.
+        """
+        here, texts = self.hold_ned[2], []
+        if target_down is None or not math.isfinite(target_down):
+            height = self._get("MIS_TAKEOFF_ALT")
+            target_down = here - height
+            texts.append(Text(Severity.INFO, f"Using default takeoff altitude: {height:.1f} m"))
+        if target_down > here:
+            target_down = here
+            texts.append(Text(Severity.CRITICAL, "Already higher than takeoff altitude"))
+        self.target_down = target_down
+        return texts
+
     def reached(self, down: float) -> bool:
         """Is the take-off height reached? down: m."""
         return self.target_down is not None and abs(down - self.target_down) < 0.3 and abs(self._climb) < 0.5
@@ -117,11 +142,11 @@ class Navigator:
             ground_contact: from the land detector. landed: likewise.
             home_down: height of home in the local frame, m (down).
         """
-        request = self.request
-        request["yaw_sp"] = self.yaw
-        request["position_sp"][0, 0] = self.hold_ned[0]
-        request["position_sp"][0, 1] = self.hold_ned[1]
-        request["velocity_sp"][0] = 0.0
+        position_sp, velocity_sp = self._position_sp, self._velocity_sp
+        self._yaw_sp[0] = self.yaw
+        position_sp[0] = self.hold_ned[0]
+        position_sp[1] = self.hold_ned[1]
+        velocity_sp[:] = 0.0
         if self.state is TakeoffState.SPOOLUP and now_us - self._armed_us >= self._get("COM_SPOOLUP_TIME") * 1e6:
             self.state = TakeoffState.READY
         if self.state is TakeoffState.FLIGHT and landed:
@@ -132,16 +157,16 @@ class Navigator:
             self._ramp = 0.0
             self._climb = 0.0
         if self.state in (TakeoffState.DISARMED, TakeoffState.SPOOLUP, TakeoffState.READY):
-            request["idle"] = True
+            self._idle[0] = True
             self.hold_ned = list(position)
             self.descending = True
             return
-        request["idle"] = ground_contact and self.state is TakeoffState.FLIGHT and self.descending
+        self._idle[0] = ground_contact and self.state is TakeoffState.FLIGHT and self.descending
         if self.descending:
-            request["position_sp"][0, 2] = math.nan
-            request["velocity_sp"][0, 2] = self._speed_up_to(self._landing_speed(home_down - position[2]), dt_s)
+            position_sp[2] = math.nan
+            velocity_sp[2] = self._speed_up_to(self._landing_speed(home_down - position[2]), dt_s)
             if mode is Mode.DESCEND:
-                request["position_sp"][0, :2] = math.nan
+                position_sp[:2] = math.nan
             return
         if mode is Mode.TAKEOFF and self.target_down is not None:
             towards = self._get("MPC_Z_P") * (self.target_down - position[2])
@@ -149,10 +174,10 @@ class Navigator:
             climb = self._speed_up_to(towards, dt_s)
             if self.state is TakeoffState.RAMPUP:
                 climb = self._ramped(climb, dt_s)
-            request["position_sp"][0, 2] = math.nan
-            request["velocity_sp"][0, 2] = climb
+            position_sp[2] = math.nan
+            velocity_sp[2] = climb
             return
-        request["position_sp"][0, 2] = self.hold_ned[2]
+        position_sp[2] = self.hold_ned[2]
 
     def _is_above(self, down: float) -> bool:
         """Is there any way up to the take-off height? down: where the vehicle is, m."""

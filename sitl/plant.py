@@ -298,6 +298,7 @@ class Plant:
         self.delta = self.state["delta"][0]
         self.velocity = self.state["velocity"][0]
         self.rates = self.x[10:13]
+        self.position = self.x[0:3]
         self.quat[0] = 1.0
         if not linear:
             self.x[6] = 1.0

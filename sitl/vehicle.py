@@ -167,7 +167,6 @@ class Vehicle:
         self.plant.step(self._commands)
         self.tick += 1
         now_us = self.time_us
-        self.autopilot.remember_velocity()
         self._sensors.sample(now_us)
         self._commands = self.autopilot.tick(now_us)
 

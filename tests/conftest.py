@@ -72,11 +72,11 @@ class Flight:
         return [time_s for time_s, said in self.texts if said == text]
 
     def get_ready(self) -> None:
-        self.run_until(lambda: self.autopilot.ready, 5.0)
+        self.run_until(lambda: self.autopilot.healthy, 5.0)
 
     def arm(self) -> float:
         """Arm; vehicle time of it, s."""
-        if not self.autopilot.ready:
+        if not self.autopilot.healthy:
             self.get_ready()
         assert self.autopilot.command_arm(True) is Result.ACCEPTED, self.autopilot.rejection
         self.listen()

@@ -24,6 +24,8 @@ APPLICATION_ID = "froude"
 ROWS_PER_CHUNK = 500
 LIVE_ROWS_PER_CHUNK = 50
 DEG = 180.0 / math.pi
+MOTORS = 8
+"""As many as the telemetry has columns for; further ones are not drawn."""
 _NOTHING_YET = -2
 
 Columns = Mapping[str, NDArray[Any]]
@@ -103,9 +105,10 @@ class FlightRecorder:
         rows_per_chunk: int | None = None,
     ) -> None:
         self._chunk = rows_per_chunk or (ROWS_PER_CHUNK if live_port is None else LIVE_ROWS_PER_CHUNK)
+        self._extremes = roll_extremes(rotors)
+        rotors = rotors[:MOTORS]
         self._motors = len(rotors)
         self._motor_colours = [PALETTE[n % len(PALETTE)] for n in range(self._motors)]
-        self._extremes = roll_extremes(rotors)
         self._waiting: list[Columns] = []
         self._waiting_rows = 0
         self._last_mode = _NOTHING_YET

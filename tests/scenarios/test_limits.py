@@ -46,19 +46,19 @@ def test_infinite_margin_passes_a_minimum() -> None:
 def test_failures_name_value_and_limit() -> None:
     outcome, reason, _ = judge(changed("delay_margin_s", 0.0042), LIMIT_SETS["practical"])
     assert outcome is Outcome.FAIL
-    assert reason == "delay_margin_s 0.0042 s, limit >= 0.01 s"
+    assert reason == "delay margin 4.2 ms, limit >= 10 ms"
 
 
 def test_an_unmeasured_limited_metric_is_unset_not_failed() -> None:
     outcome, reason, _ = judge(changed("rise_time_s", None, "never reaches 90 %"), LIMIT_SETS["practical"])
     assert outcome is Outcome.UNSET
-    assert reason == "rise_time_s unset: never reaches 90 %"
+    assert reason == "rise time unset: never reaches 90 %"
 
 
 def test_a_limit_on_something_never_measured_is_listed_as_unset() -> None:
     outcome, reason, metrics = judge(GOOD, (Limit("lag_s", maximum=0.2),))
     assert outcome is Outcome.UNSET
-    assert reason == "lag_s unset: not measured in this scenario"
+    assert reason == "lag unset: not measured in this scenario"
     assert metrics[-1].name == "lag_s"
     assert metrics[-1].outcome is Outcome.UNSET
 
@@ -67,7 +67,7 @@ def test_fail_beats_unset() -> None:
     metrics = [m for m in changed("overshoot_pct", 40.0) if m.name != "rise_time_s"]
     outcome, reason, _ = judge(metrics, LIMIT_SETS["practical"])
     assert outcome is Outcome.FAIL
-    assert reason == "overshoot_pct 40 %, limit <= 10 %"
+    assert reason == "overshoot 40 %, limit <= 10 %"
 
 
 @pytest.mark.parametrize("limits", [(), (Limit("vaf_pct", minimum=50.0),), LIMIT_SETS["study"]])

@@ -1,0 +1,60 @@
+"""What follows from being on the ground: "Takeoff detected", "Landing detected", and disarming by itself.
+
+Source: PX4 ``commander`` (COM_DISARM_LAND, COM_DISARM_PRFLT).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from sitl.parameters import ParameterTable
+
+_GRACE_S = 1.0
+"""PX4 counts COM_DISARM_PRFLT from one second after arming."""
+
+
+class LandingWatch:
+    """Follows one armed stretch from arming to disarming.
+
+    Args:
+        parameters: COM_DISARM_LAND, COM_DISARM_PRFLT.
+
+    Attributes:
+        disarm: the text to disarm with; empty while there is no reason to.
+    """
+
+    def __init__(self, parameters: ParameterTable) -> None:
+        self._parameters = parameters
+        self.on_arm(0)
+
+    def on_arm(self, now_us: int) -> None:
+        """A new stretch begins."""
+        self.disarm = ""
+        self._armed_us = now_us
+        self._took_off = False
+        self._landed_us: int | None = None
+
+    def update(self, now_us: int, landed: bool) -> Iterator[str]:
+        """Look once more; texts to say.
+
+        Args:
+            now_us: vehicle time, us. landed: from the land detector.
+        """
+        if not landed:
+            self._landed_us = None
+            if not self._took_off:
+                self._took_off = True
+                yield "Takeoff detected"
+        elif self._took_off:
+            if self._landed_us is None:
+                self._landed_us = now_us
+                yield "Landing detected"
+            if self._over("COM_DISARM_LAND", now_us - self._landed_us):
+                self.disarm = "Disarmed by landing"
+        elif self._over("COM_DISARM_PRFLT", now_us - self._armed_us - round(_GRACE_S * 1e6)):
+            self.disarm = "Disarmed by auto preflight disarming"
+
+    def _over(self, parameter: str, waited_us: int) -> bool:
+        """Has the time in a parameter passed? Zero or less means never."""
+        wait_s = float(self._parameters.get(parameter))
+        return wait_s > 0.0 and waited_us >= wait_s * 1e6
