@@ -75,10 +75,9 @@ class Client:
         self.on_text: Callable[[float, int, str], object] | None = None
         self.background: Callable[[int], int] | None = None
         self.params = ParamClient(0, 1, own_system=sysid)
-        self._subscribers: dict[str, list[Callable[[Message], object]]] = {}
         self._acks: list[tuple[int, int]] = []
         self._next_heartbeat_us = -1
-        self._own: dict[str, Callable[[Message], object]] = {
+        own: dict[str, Callable[[Message], object]] = {
             **self.state.handlers(),
             "HEARTBEAT": self._on_heartbeat,
             "ATTITUDE": self._on_attitude,
@@ -86,7 +85,10 @@ class Client:
             "SYSTEM_TIME": self._on_system_time,
             "COMMAND_ACK": self._on_ack,
             "STATUSTEXT": self._on_text,
+            **dict.fromkeys(("PARAM_VALUE", "PARAM_ERROR"), self._on_param),
         }
+        # our own look at a message comes before any subscriber's
+        self._handlers = {name: [handler] for name, handler in own.items()}
 
     def now_us(self) -> int:
         """Vehicle time, us."""
@@ -94,7 +96,7 @@ class Client:
 
     def subscribe(self, name: str, handler: Callable[[Message], object]) -> None:
         """Call a handler with every message of that name, after the client has looked at it itself."""
-        self._subscribers.setdefault(name, []).append(handler)
+        self._handlers.setdefault(name, []).append(handler)
 
     # -- time and messages -------------------------------------------------------------------------------------
 
@@ -144,13 +146,11 @@ class Client:
     def _take(self, message: Message) -> None:
         if message.sysid != self.target_system and (self.target_system or message.name != "HEARTBEAT"):
             return  # another system's; before the first heartbeat nobody knows whose
-        own = self._own.get(message.name)
-        if own is not None:
-            own(message)
-        elif message.name.startswith("PARAM_"):
-            self.params.handle(message, self.now_us())
-        for handler in self._subscribers.get(message.name, ()):
+        for handler in self._handlers.get(message.name, ()):
             handler(message)
+
+    def _on_param(self, message: Message) -> None:
+        self.params.handle(message, self.now_us())
 
     def _on_heartbeat(self, m: Message) -> None:
         if m.compid != 1 or m.autopilot == _INVALID_AUTOPILOT:

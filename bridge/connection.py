@@ -13,15 +13,17 @@ unsigned.
 from __future__ import annotations
 
 import difflib
+import struct
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from bridge.framing import MAGIC_2, Counters, FrameSplitter, crc16
-from bridge.messages import BY_ID, BY_NAME, Message
+from bridge.framing import Counters, FrameSplitter, crc16
+from bridge.messages import BY_ID, BY_NAME, MAGIC_2, Message
 from sitl.errors import UsageError
 
 __all__ = ["Connection", "Counters", "Message"]
 
+_HEADER = struct.Struct("<6B3s")
 _MAGIC = bytes([MAGIC_2])
 
 
@@ -82,9 +84,8 @@ class Connection:
         # MAVLink 2 cuts the zeros off the end but keeps one byte.
         payload = kind.pack(fields)
         payload = payload.rstrip(b"\0") or payload[:1]
-        head = bytes((len(payload), 0, 0, self.sent & 0xFF, self.sysid, self.compid))
-        body = head + kind.id_bytes + payload
-        frame = _MAGIC + body + crc16(kind.crc_extra, crc16(body)).to_bytes(2, "little")
+        body = _HEADER.pack(len(payload), 0, 0, self.sent & 0xFF, self.sysid, self.compid, kind.id_bytes) + payload
+        frame = _MAGIC + body + crc16(body + kind.crc_extra).to_bytes(2, "little")
         self.sent += 1
         if self.on_frame is not None:
             self.on_frame(frame)
@@ -92,7 +93,8 @@ class Connection:
 
     def receive(self, data: bytes) -> list[Message]:
         """Return the messages these bytes complete, in order; damage is counted and never raises."""
-        return self._logged(self._splitter.feed(data))
+        messages = self._splitter.feed(data)
+        return messages if self.on_frame is None else self._logged(messages)
 
     def flush(self) -> list[Message]:
         """Return what a quiet stream still holds: messages that waited for bytes that do not come."""

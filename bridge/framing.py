@@ -23,17 +23,20 @@ from enum import Enum, auto
 
 import fastcrc
 
-from bridge.messages import Message, MessageType
+from bridge.messages import (
+    HEADER_1,
+    HEADER_2,
+    MAGIC_1,
+    MAGIC_2,
+    SIGNATURE,
+    SIGNED,
+    Message,
+    MessageType,
+)
 
 # CRC-16/MCRF4XX of the bytes, optionally going on from an earlier checksum.
 crc16: Callable[..., int] = fastcrc.crc16.mcrf4xx
 
-MAGIC_1 = 0xFE
-MAGIC_2 = 0xFD
-HEADER_1 = 6
-HEADER_2 = 10
-SIGNED = 0x01
-SIGNATURE = 13
 LARGEST = HEADER_2 + 255 + 2 + SIGNATURE
 BUFFER_LIMIT = 2 * LARGEST
 
@@ -129,7 +132,7 @@ class FrameSplitter:
             ):
                 self._counters.received += 1
                 self._counters.heard(data[5], data[6], data[4])
-                return [Message(kind, data, HEADER_2, stop, data[4], data[5], data[6], False)]
+                return [Message(kind, data, HEADER_2, stop, data[5])]
         return self._split(self._rest + data if self._rest else data, final=self._datagram)
 
     def flush(self) -> list[Message]:
@@ -231,7 +234,7 @@ class FrameSplitter:
             stop = start + length
             total = stop + 2 + SIGNATURE if flags else stop + 2
             credible = kind is not None and length <= kind.size
-            seq, sysid, compid = buffer[at + 4], buffer[at + 5], buffer[at + 6]
+            sysid = buffer[at + 5]
         elif buffer[at] == MAGIC_1:
             if available < HEADER_1:
                 return _Verdict.DOUBTFUL, at
@@ -245,7 +248,7 @@ class FrameSplitter:
             stop = start + length
             total = stop + 2
             credible = kind is not None
-            seq, sysid, compid = buffer[at + 2], buffer[at + 3], buffer[at + 4]
+            sysid = buffer[at + 3]
         else:
             return _Verdict.NO_FRAME, at
         if available < total:
@@ -256,4 +259,4 @@ class FrameSplitter:
         checksum = crc16(kind.crc_extra, crc16(frame[1:stop]))
         if checksum != frame[stop] | frame[stop + 1] << 8:
             return _Verdict.BAD_CRC, at + total
-        return Message(kind, frame, start, stop, seq, sysid, compid, bool(flags))
+        return Message(kind, frame, start, stop, sysid)

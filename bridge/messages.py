@@ -41,6 +41,13 @@ _FORMATS = {
     "float": "f",
     "double": "d",
 }
+MAGIC_1 = 0xFE
+MAGIC_2 = 0xFD
+HEADER_1 = 6
+HEADER_2 = 10
+SIGNED = 0x01
+SIGNATURE = 13
+
 _FAILURES = (struct.error, OverflowError, TypeError, ValueError)
 
 
@@ -250,42 +257,34 @@ class Message:
         raw_frame: the whole frame as received, for logs.
     """
 
-    __slots__ = (
-        "__dict__",
-        "_start",
-        "_stop",
-        "_type",
-        "compid",
-        "id",
-        "name",
-        "raw_frame",
-        "seq",
-        "signed",
-        "sysid",
-    )
+    __slots__ = ("__dict__", "_type", "name", "raw_frame", "sysid")
 
-    def __init__(
-        self,
-        kind: MessageType,
-        raw_frame: bytes,
-        start: int,
-        stop: int,
-        seq: int,
-        sysid: int,
-        compid: int,
-        signed: bool,
-    ) -> None:
+    def __init__(self, kind: MessageType, raw_frame: bytes, start: int, stop: int, sysid: int) -> None:
         self.__dict__ = kind.unpack(raw_frame, start, stop)
         self._type = kind
-        self._start = start
-        self._stop = stop
         self.name = kind.name
-        self.id = kind.id
         self.raw_frame = raw_frame
-        self.seq = seq
         self.sysid = sysid
-        self.compid = compid
-        self.signed = signed
+
+    @property
+    def id(self) -> int:
+        """Message id."""
+        return self._type.id
+
+    @property
+    def seq(self) -> int:
+        """The sender's packet counter, 0 to 255."""
+        return self.raw_frame[4 if self.raw_frame[0] == MAGIC_2 else 2]
+
+    @property
+    def compid(self) -> int:
+        """Who sent it: component."""
+        return self.raw_frame[6 if self.raw_frame[0] == MAGIC_2 else 4]
+
+    @property
+    def signed(self) -> bool:
+        """Whether it carried a signature (which is not checked here)."""
+        return self.raw_frame[0] == MAGIC_2 and bool(self.raw_frame[2] & SIGNED)
 
     if TYPE_CHECKING:
         # The fields are in __dict__; which ones depends on the message.
@@ -294,7 +293,8 @@ class Message:
     @property
     def raw_payload(self) -> bytes:
         """The payload as received: zeros at its end may be missing."""
-        return self.raw_frame[self._start : self._stop]
+        start = HEADER_2 if self.raw_frame[0] == MAGIC_2 else HEADER_1
+        return self.raw_frame[start : start + self.raw_frame[1]]
 
     def fields(self) -> dict[str, Any]:
         """Return every field's value by name, in wire order."""

@@ -42,7 +42,14 @@ class FlightFiles:
     """
 
     def __init__(
-        self, folder: Path, slug: str, *, name: str, rotors: tuple[Rotor, ...], live_port: int | None = None
+        self,
+        folder: Path,
+        slug: str,
+        *,
+        name: str,
+        rotors: tuple[Rotor, ...],
+        live_port: int | None = None,
+        rows_per_chunk: int | None = None,
     ) -> None:
         from scenarios.recorder import FlightRecorder
 
@@ -54,6 +61,7 @@ class FlightFiles:
             recording_id=f"{folder.parent.name}-{slug}",
             rotors=rotors,
             live_port=live_port,
+            rows_per_chunk=rows_per_chunk,
         )
         try:
             self._tlog = TlogWriter(self.path(".partial.tlog"))
@@ -77,7 +85,11 @@ class FlightFiles:
     def frame(self, time_us: int, frame: bytes) -> None:
         """Log a MAVLink frame that passed at a vehicle time, us."""
         if self.problem is None:
-            self._attempt(lambda: self._tlog.write(time_us, frame))
+            # written out, because it runs at every frame
+            try:
+                self._tlog.write(time_us, frame)
+            except FroudeError as error:
+                self.problem = error
 
     def rows(self, batch: Columns) -> None:
         """Record finished rows of telemetry."""

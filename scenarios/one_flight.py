@@ -79,6 +79,13 @@ class FlightJob:
     patience_s: float = 5.0
 
     @property
+    def rows_per_batch(self) -> int:
+        """Telemetry rows that are written together: few for eyes that watch or a link that may die, else many."""
+        if self.live_port is not None:
+            return 50
+        return sampler.ROWS_PER_BATCH if self.in_memory else 250
+
+    @property
     def in_memory(self) -> bool:
         """The vehicle is ours, in this thread."""
         return self.connect.startswith(MEMORY)
@@ -170,6 +177,7 @@ class _Flight:
                     name=job.gain_set.name,
                     rotors=job.model.airframe.rotors,
                     live_port=job.live_port,
+                    rows_per_chunk=job.rows_per_batch,
                 )
             )
         client = self._open_client()
@@ -226,7 +234,9 @@ class _Flight:
         self._stack.callback(link.close)
         files = self._files
         client = Client(link, drive, log=files.frame if files else None)
-        self._sampler = Sampler(client, self._inverse(), files.rows if files else None)
+        self._sampler = Sampler(
+            client, self._inverse(), files.rows if files else None, rows_per_batch=job.rows_per_batch
+        )
         return client
 
     def _inverse(self) -> Any:

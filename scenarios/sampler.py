@@ -28,7 +28,7 @@ SAMPLED = (ATTITUDE, ATTITUDE_TARGET, HIL_ACTUATOR_CONTROLS, HIL_STATE_QUATERNIO
 FAST_INTERVAL_US = 4_000
 CRUISE_INTERVAL_US = 20_000
 
-ROWS_PER_BATCH = 500
+ROWS_PER_BATCH = 2000
 _MOTORS_SHOWN = 8
 _FIXED_VALUES = 7 + 8 + 6 + 2
 _NAN3 = (float("nan"),) * 3
@@ -46,7 +46,7 @@ class Sampler:
         client: whose messages.
         inverse: (2, n) delta_lat and delta_lon per unit of motor command: the pseudo-inverse of the airframe's
             normalised mix.
-        on_batch: called with every few hundred finished rows, in order.
+        on_batch: called with every `rows_per_batch` finished rows, in order.
     """
 
     def __init__(
@@ -54,7 +54,10 @@ class Sampler:
         client: Client,
         inverse: npt.NDArray[np.float64],
         on_batch: Callable[[Columns], object] | None = None,
+        *,
+        rows_per_batch: int = ROWS_PER_BATCH,
     ) -> None:
+        self._rows_per_batch = rows_per_batch
         self._state = client.state
         self._inverse = inverse
         self._motor_count = inverse.shape[1]
@@ -107,7 +110,7 @@ class Sampler:
             (*self._attitude, *rates, *self._target, *self._position, *self._motors, state.nav_state, state.armed)
         )
         self._attitude = None
-        if len(self._rows) >= ROWS_PER_BATCH * self._values:
+        if len(self._rows) >= self._rows_per_batch * self._values:
             self.flush()
 
     def flush(self) -> None:

@@ -275,8 +275,9 @@ class Autopilot:
             self.healthy = True
             self._set_home()
         phi, theta, _ = self._plant.euler()
-        self.land_detector.update(now, self._motion(), self._land_limits, self.armed)
-        self.control.set_landed(self.land_detector.maybe_landed)
+        if not self.land_detector.flies(self.control.thrust_sp, self._land_limits):
+            self.land_detector.update(now, self._motion(), self._land_limits, self.armed)
+            self.control.set_landed(self.land_detector.maybe_landed)
         self._tilt.update(now, phi, theta, not self.control.stopped)
         if self._tilt.failed and not self.terminated:
             self._on_tilt()

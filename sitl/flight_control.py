@@ -125,7 +125,7 @@ class FlightControl:
             thrust: 0..1. fly: at once; otherwise it waits for `fly_setpoint`.
         """
         shown = quat if quat is not None else (1.0, 0.0, 0.0, 0.0)
-        self._attitude_sp = AttitudeSetpoint(now_us, shown, rates, thrust, self._attitude_sp.count + 1)
+        self._attitude_sp = AttitudeSetpoint(now_us, shown, rates, thrust, self._attitude_sp.serial + 1)
         self._waiting_level = control_loop.RATES if quat is None else control_loop.ATTITUDE
         self._rates_sp[:] = rates
         self._yaw_rate_sp[0] = rates[2]
@@ -183,7 +183,8 @@ class FlightControl:
         self._yaw_rate_sp[0] = math.nan
         self._level[0] = control_loop.ATTITUDE
         w, x, y, z = self._held_quat.tolist()
-        self._attitude_sp = AttitudeSetpoint(now_us, (w, x, y, z), (0.0, 0.0, 0.0), thrust, self._attitude_sp.count + 1)
+        serial = self._attitude_sp.serial + 1
+        self._attitude_sp = AttitudeSetpoint(now_us, (w, x, y, z), (0.0, 0.0, 0.0), thrust, serial)
 
     # -- what it shows -----------------------------------------------------------------------------------------
 
@@ -195,14 +196,14 @@ class FlightControl:
     @property
     def attitude_sp_count(self) -> int:
         """How many attitude set-points there have been: cheap to watch for a new one."""
-        return self._attitude_sp.count
+        return self._attitude_sp.serial
 
     @property
     def attitude_sp(self) -> AttitudeSetpoint:
         """Attitude set-point with the rate set-point that the attitude law now makes of it."""
         p, q, r = self.state["rates_sp"][0].tolist()
         sp = self._attitude_sp
-        return AttitudeSetpoint(sp.time_us, sp.quat, (p, q, r), sp.thrust, sp.count)
+        return AttitudeSetpoint(sp.time_us, sp.quat, (p, q, r), sp.thrust, sp.serial)
 
     def position_sp(self, now_us: int, *, used: bool) -> PositionSetpoint:
         """What the position controller was asked for last. used: a mode that holds a position is flown."""

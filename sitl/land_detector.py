@@ -62,6 +62,12 @@ class LandDetector:
         self._maybe_since: int | None = None
         self._landed_since: int | None = None
 
+    def flies(self, thrust: float, limits: LandLimits) -> bool:
+        """Is it in the air, with so much thrust that nothing else need be looked at?"""
+        if self.landed or self._contact_since is not None:
+            return False
+        return thrust > limits.thr_min + _LOW_THROTTLE * (limits.hover_thrust - limits.thr_min)
+
     def update(self, now_us: int, motion: Motion, limits: LandLimits, armed: bool) -> None:
         """Look once more; call at 100 Hz.
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,8 +49,13 @@ def geodetic(
 ) -> tuple[float, float, float]:
     """Latitude (deg), longitude (deg), height (m AMSL) of a NED position (m) on a locally flat earth."""
     lat = origin[0] + position_ned[0] / _METRES_PER_DEG
-    lon = origin[1] + position_ned[1] / (_METRES_PER_DEG * math.cos(math.radians(origin[0])))
+    lon = origin[1] + position_ned[1] / _metres_per_deg_east(origin[0])
     return lat, lon, origin[2] - position_ned[2]
+
+
+@cache
+def _metres_per_deg_east(lat_deg: float) -> float:
+    return _METRES_PER_DEG * math.cos(math.radians(lat_deg))
 
 
 def pressure_hpa(alt_m: float) -> float:

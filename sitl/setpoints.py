@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 
-@dataclass(frozen=True)
-class AttitudeSetpoint:
+class AttitudeSetpoint(NamedTuple):
     """The attitude and rate set-points in force.
 
     Attributes:
         time_us: when it came. quat: body to world. rates: (p, q, r) set-points, rad/s. thrust: 0..1.
-        count: grows by one with every new set-point.
+        serial: grows by one with every new set-point.
     """
 
     time_us: int = 0
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     rates: tuple[float, float, float] = (0.0, 0.0, 0.0)
     thrust: float = 0.0
-    count: int = 0
+    serial: int = 0
 
 
-@dataclass(frozen=True)
-class PositionSetpoint:
+class PositionSetpoint(NamedTuple):
     """The position controller's set-points, NED, m, m/s, m/s^2, rad, rad/s; NaN where unused."""
 
     time_us: int
@@ -31,4 +29,4 @@ class PositionSetpoint:
     acceleration_ned: tuple[float, float, float]
     yaw: float
     yaw_rate: float
-    count: int
+    serial: int

@@ -1,6 +1,9 @@
 """A run of three flights as the runner would hand it to the outputs: one passes, one oscillates, one was broken off."""
 
+import dataclasses
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +11,10 @@ import pytest
 from scenarios.flight import Event, FlightRecord, RunRecord, Segment
 from scenarios.gain_set import GainSet
 from scenarios.limits import LIMIT_SETS, judge, measured
-from scenarios.scenario import Scenario
+from scenarios.manoeuvres import make_manoeuvre
+from scenarios.one_flight import FlightJob
+from scenarios.runner import plan
+from scenarios.scenario import Gate, Scenario, load_scenario
 from scenarios.telemetry import Telemetry
 
 BOOT_S = 4.0
@@ -156,3 +162,53 @@ def flown_run() -> RunRecord:
     return RunRecord(
         scenario, vehicle, profile, (passes, cycles, broken), None, "2026-11-22T20:00:00Z", {"froude": "0.1.0"}
     )
+
+
+QuickScenario = Callable[..., Scenario]
+QuickJob = Callable[..., FlightJob]
+
+
+@pytest.fixture(scope="session")
+def quick_scenario() -> QuickScenario:
+    """Makes scenarios that are over soon: a roll step from 3 m height; arguments replace its items."""
+
+    def make(**changes: Any) -> Scenario:
+        rate_hz = changes.get("setpoint_rate_hz", 50.0)
+        step = make_manoeuvre("step", amplitude_deg=10.0, hold_s=2.0, return_s=2.0, setpoint_rate_hz=rate_hz)
+        quick = dataclasses.replace(
+            load_scenario("roll_step"),
+            gain_sets=("table_2_2/ANT-X",),
+            takeoff_altitude_m=3.0,
+            gate=Gate(hold_s=0.5, timeout_s=4.0),
+            manoeuvres=(step,),
+        )
+        return dataclasses.replace(quick, **changes)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def quick_job(quick_scenario: QuickScenario) -> QuickJob:
+    """Makes jobs of the quick scenario; `gains` None: the airframe's own flight gains, `job` items of the job."""
+
+    def make(
+        gains: dict[str, float | int] | None = None,
+        name: str = "set",
+        job: dict[str, Any] | None = None,
+        **changes: Any,
+    ) -> FlightJob:
+        scenario = quick_scenario(**changes)
+        model = scenario.resolve_vehicle()
+        own = model.airframe.flight_gains
+        if gains is None:
+            assert own is not None
+            gains = {
+                "MC_ROLL_P": own.k_phi,
+                "MC_ROLLRATE_P": own.kp,
+                "MC_ROLLRATE_I": own.ki,
+                "MC_ROLLRATE_D": own.kd,
+            }
+        made = plan(GainSet(name, gains), scenario, model, scenario.resolve_profile())
+        return dataclasses.replace(made, **(job or {}))
+
+    return make
