@@ -22,7 +22,7 @@ from sitl.modes import Mode
 from sitl.parameters import ParameterType
 
 ACK_TIMEOUT_US = 500_000
-ACK_TRIES = 10  # a command and its answer both get through a link that loses 30 % once in two tries
+ACK_TRIES = 20  # where 30 % are lost each way, half the tries fail
 HEARTBEAT_US = 1_000_000
 LONGEST_WAIT_US = 20_000
 

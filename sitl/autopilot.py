@@ -107,9 +107,7 @@ class Autopilot:
         """On the ground, in the air, taking off or landing."""
         if self.land_detector.landed:
             return LandedState.ON_GROUND
-        if self.mode is Mode.TAKEOFF:
-            return LandedState.TAKEOFF
-        return LandedState.LANDING if self.mode is Mode.LAND else LandedState.IN_AIR
+        return {Mode.TAKEOFF: LandedState.TAKEOFF, Mode.LAND: LandedState.LANDING}.get(self.mode, LandedState.IN_AIR)
 
     @property
     def attitude_sp_count(self) -> int:

@@ -179,7 +179,7 @@ class TestCommands:
     def test_it_is_asked_again_and_then_given_up(self) -> None:
         peer = Peer(lambda _: [])
         peer.client.connect()
-        with pytest.raises(PeerSilent, match=r"no sign of an answer to land within 5 s"):
+        with pytest.raises(PeerSilent, match=r"no sign of an answer to land within 10 s"):
             peer.client.land()
         commands = [message for message in peer.heard if message.name == "COMMAND_LONG"]
         assert [message.confirmation for message in commands] == list(range(ACK_TRIES))

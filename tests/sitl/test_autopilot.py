@@ -389,7 +389,7 @@ def test_set_points_are_counted_and_stamped(hover: Any) -> None:
     hover.autopilot.offboard_attitude((0.0, 0.0, 0.0, 0.0), STILL, -0.5)
     hover.vehicle.step()
     after = hover.autopilot.attitude_sp
-    assert after.count == before.count + 1 == hover.autopilot.attitude_sp_count
+    assert after.serial == before.serial + 1 == hover.autopilot.attitude_sp_count
     assert after.time_us == hover.vehicle.time_us - hover.vehicle.tick_us
     assert after.quat == (0.0, 0.0, 0.0, 0.0)
     assert after.thrust == 0.5
