@@ -141,6 +141,14 @@ def _tell(text: str, status: int = EXIT_OK) -> int:
     return status
 
 
+def _tell_of_compiling() -> None:
+    """The first flight of a version takes longer: say so before it."""
+    from sitl.compiled import is_warm
+
+    if not is_warm():
+        _tell("compiling the control laws, once; up to half a minute ...")
+
+
 def _words(text: str | None, default: tuple[str, ...]) -> tuple[str, ...]:
     return default if text is None else tuple(word.strip() for word in text.split(",") if word.strip())
 
@@ -220,6 +228,7 @@ def _fly(args: argparse.Namespace) -> int:
         _tell(f"live view: rerun --connect rerun+http://127.0.0.1:{options.live_port}/proxy")
     # Rerun's own log lines come from other threads, right through the table; what they say we find out ourselves.
     os.environ.setdefault("RUST_LOG", "off")
+    _tell_of_compiling()
     landing = "stopping: the vehicle lands and gets its parameters back; Ctrl-C again leaves it as it is"
     with interrupts.caught(lambda: _tell(landing) if args.connect else None):
         with _progress_bar() as progress:
@@ -327,6 +336,7 @@ def _sitl(args: argparse.Namespace) -> int:
         except ValueError:
             raise UsageError(f"--speed {args.speed}: give a number above 0, or 'max'") from None
     model = resolve_vehicle(args.spec, _words(args.scaling, DEFAULT_SCALING))
+    _tell_of_compiling()
     vehicle = Vehicle(model, get_profile(args.profile or "sitl"), seed=args.seed)
     links = open_links(args.link or default_urls(args.instance), instance=args.instance)
     terminal = sys.stderr is not None and sys.stderr.isatty()

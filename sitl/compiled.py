@@ -60,6 +60,11 @@ def cache_folder() -> Path:
     return Path(tempfile.mkdtemp(prefix="froude-laws-"))
 
 
+def is_warm() -> bool:
+    """Has this version's machine code been made before?"""
+    return any(cache_folder().rglob("*.nbc"))
+
+
 def _forget_old(base: Path) -> None:
     """Remove the folders of all but the latest few versions."""
     folders = sorted(base.glob("laws-*"), key=lambda folder: folder.stat().st_mtime, reverse=True)

@@ -117,7 +117,7 @@ def airframe_file(folder: Path, layout: str, rotors: int) -> Path:
     """ANT-X's model on arms all around, every other rotor turning the other way; X8: two on each of four arms."""
     arms = rotors // 2 if layout == "X8" else rotors
     lines = [
-        f'name = "MINE"\nmass_kg = 0.3\nframe_m = [0.2, 0.2, 0.04]\ndiagonal_m = 0.2\nlateral_m = 0.15',
+        'name = "MINE"\nmass_kg = 0.3\nframe_m = [0.2, 0.2, 0.04]\ndiagonal_m = 0.2\nlateral_m = 0.15',
         f'layout = "{layout}"',
         "[derivatives]\nYv_1_s = -0.1068\nYp_m_s_rad = 0.1192\nYd_m_s2 = -10.1647",
         "Lv_rad_m_s = -5.9755\nLp_1_s = -2.6478\nLd_rad_s2 = 450.71",

@@ -375,3 +375,11 @@ def test_battery_gives_under_load(flight: Any) -> None:
     assert loaded.voltage_v < idle.voltage_v
     assert loaded.current_a > idle.current_a == 0.0
     assert loaded.remaining == 1.0
+
+
+def test_the_machine_code_is_kept_under_this_version(flight: Any) -> None:
+    from sitl.compiled import cache_folder, is_warm
+
+    flight().run(0.01)
+    assert is_warm()
+    assert cache_folder().name.startswith("laws-")
