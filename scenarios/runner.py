@@ -259,6 +259,7 @@ def _fly_side_by_side(jobs: Sequence[FlightJob], workers: int, progress: Callabl
     # spawn: a forked child of a process that has started Arrow's or Rerun's threads may hang
     pool = ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn"))
     flights: dict[Future[FlightRecord], int] = {}
+    progress(Progress(0, len(jobs), jobs[0].gain_set.name, f"{min(workers, len(jobs))} at a time"))
     try:
         with interrupts.kept_from_children():
             flights = {pool.submit(fly, job): index for index, job in enumerate(jobs)}

@@ -14,6 +14,7 @@ import pytest
 
 from scenarios import cli
 from scenarios.cli import main
+from scenarios.one_flight import fly
 
 QUICK = """
 title = "quick"
@@ -55,6 +56,12 @@ def froude(capsys: pytest.CaptureFixture[str]) -> Froude:
         return status, out, err
 
     return run
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compiled(quick_job: Any) -> None:
+    """The first flight of a version says that it takes longer; these are about the ones after it."""
+    fly(quick_job(manoeuvres=()))
 
 
 def one_line(err: str) -> str:
