@@ -271,7 +271,8 @@ def _report(args: argparse.Namespace, result: RunResult) -> int:
     else:
         width, colour = terminal_width(sys.stdout)
         text = run_text(run, folder, width=width, colour=colour)
-    stopped = result.stopped or _show(text)
+    unread = _show(text)
+    stopped = result.stopped or unread
     if args.junit is not None:
         from scenarios.junit import write_junit
 

@@ -114,14 +114,15 @@ class FlightFiles:
         from scenarios.markdown import flight_page
         from scenarios.recorder.comparison import flight_properties
 
+        streamed = self.problem is None
         if len(record.telemetry):
             about = {"gain_set": record.gain_set.name, "vehicle": record.vehicle_spec}
             self._attempt(lambda: record.telemetry.to_parquet(self.path(".parquet"), about))
         for segment in record.segments:
             self._recorder.segment(segment)
-        if self.problem is None:
+        if streamed:
+            self._attempt(self._finish_log)
             self._attempt(lambda: self._recorder.close(flight_page(record), flight_properties(record)))
-        self._attempt(self._finish_log)
 
     def _finish_log(self) -> None:
         self._tlog.close()

@@ -64,12 +64,14 @@ def model_text(shown: dict[str, Any]) -> str:
     margins = shown["flight_gain_margins"]
     if margins is not None:
         lines += ["", f"  its own flight gains, loop cut at delta_lat, profile {shown['profile']}:"]
-        stable = "stable" if margins["closed_loop_stable"] else "UNSTABLE"
-        delay = margins["delay_margin_s"]
-        delay_text = "no limit" if delay is None else f"{delay * 1e3:.1f} ms"
-        phase = margins["phase_margin_deg"]
-        phase_text = "no limit" if phase is None else f"{phase:.1f} deg"
-        lines.append(f"  {stable}, phase margin {phase_text}, delay margin {delay_text}")
+        delay, phase = margins["delay_margin_s"], margins["phase_margin_deg"]
+        if margins["closed_loop_stable"]:
+            delay_text = "no limit" if delay is None else f"{delay * 1e3:.1f} ms"
+            phase_text = "no limit" if phase is None else f"{phase:.1f} deg"
+            lines.append(f"  stable, phase margin {phase_text}, delay margin {delay_text}")
+        else:
+            missing = "" if delay is None else f": the torque would have to act {-delay * 1e3:.1f} ms earlier"
+            lines.append(f"  UNSTABLE{missing}")
     lines += [
         "",
         "  assumed, not measured: " + ", ".join(f"{k} {v:g}" for k, v in shown["assumptions"].items()),

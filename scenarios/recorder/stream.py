@@ -28,6 +28,7 @@ TIMELINE = "flight_time"
 LEAST_FREE_BYTES = 16_000_000
 LEAST_LEFT_BYTES = 100_000
 FLUSH_PATIENCE_S = 30.0
+ABANDON_PATIENCE_S = 2.0
 LIVE_PATIENCE_S = 2.0
 _FOOTER = b"FOOT"
 """Ends the last bytes of a file that was finished."""
@@ -175,10 +176,9 @@ class Recording:
             FileError: not everything could be written; the partial file stays.
         """
         try:
-            # Rerun's writer dies of a full disk without a word, and a flush that it no longer answers waits for ever.
             _check_space(self.path, LEAST_LEFT_BYTES)
             self._file.flush(timeout_sec=FLUSH_PATIENCE_S)
-            self._file.disconnect()
+            self._let_go()
             with self.partial.open("rb") as file:
                 file.seek(-64, 2)
                 whole = _FOOTER in file.read()
@@ -186,7 +186,7 @@ class Recording:
                 raise RuntimeError("the file has no end")
             self.partial.replace(self.path)
         except (RuntimeError, OSError, FileError) as error:
-            self._file.disconnect()
+            self._let_go()
             problem = error.problem if isinstance(error, FileError) else error
             raise FileError(
                 self.path,
@@ -199,8 +199,18 @@ class Recording:
 
     def abandon(self) -> None:
         """Stop: the partial file keeps what was written and opens in the viewer."""
-        self._file.disconnect()
+        self._let_go()
         self._close_live()
+
+    def _let_go(self) -> None:
+        """Rerun's writer may die of a full disk on the way, and then nobody answers: wait for a while only."""
+        import rerun as rr
+
+        closing = threading.Thread(target=self._file.disconnect, daemon=True)
+        closing.start()
+        closing.join(ABANDON_PATIENCE_S)
+        if closing.is_alive():
+            rr.unregister_shutdown()  # which would wait for the same writer when the program ends
 
     def _close_live(self) -> None:
         """A viewer that hangs would hold this up for half a minute: leave it to finish by itself."""

@@ -105,7 +105,7 @@ class TestFly:
         quick.write_text('axes = "both"\n' + QUICK)
         _, out, _ = froude("fly", quick, "--json", "--out", tmp_path / "runs", "--gains", "table_7_2/ADAM-0")
         (flight,) = json.loads(out)["flights"]
-        for name in ("P", "RATE_P", "RATE_I", "RATE_D"):
+        for name in ("_P", "RATE_P", "RATE_I", "RATE_D"):
             assert flight["uploaded"][f"MC_PITCH{name}"] == flight["uploaded"][f"MC_ROLL{name}"]
 
     @pytest.mark.parametrize(
@@ -171,7 +171,7 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("change", "says"),
         [
-            (("vehicle =", "vehicel ="), '"vehicel" (did you mean "vehicle"?)'),
+            (("vehicle =", "vehicel ="), 'vehicel: unknown key (did you mean "vehicle"?)'),
             (("amplitude_deg = 10.0", "amplitude_deg = 400.0"), "manoeuvre[0].amplitude_deg: 400 is out of range"),
             (("hold_s = 2.0", "hold_s = 601.0"), "manoeuvre[0].hold_s: 601 is out of range"),
             (("[[manoeuvre]]", "[manoeuvre]"), "holds no [[manoeuvre]]"),
