@@ -149,20 +149,6 @@ def _tell_of_compiling() -> None:
         _tell("compiling the control laws, once; up to half a minute ...")
 
 
-def _telling_of_compiling(progress: Callable[[Progress], object]) -> Callable[[Progress], object]:
-    """The same callback, which says so once, when everything was found in order and the first flight begins."""
-    told = False
-
-    def show(now: Progress) -> None:
-        nonlocal told
-        if not told:
-            told = True
-            _tell_of_compiling()
-        progress(now)
-
-    return show
-
-
 def _words(text: str | None, default: tuple[str, ...]) -> tuple[str, ...]:
     return default if text is None else tuple(word.strip() for word in text.split(",") if word.strip())
 
@@ -226,6 +212,7 @@ def _fly(args: argparse.Namespace) -> int:
 
     from scenarios import interrupts
     from scenarios.one_flight import MEMORY
+    from scenarios.progress import RunWatch
     from scenarios.runner import RunOptions, run_scenario
 
     _check_junit(args.junit)
@@ -238,14 +225,23 @@ def _fly(args: argparse.Namespace) -> int:
         live_port=_live_port() if args.live else None,
         command=("froude", *args.argv),
     )
-    if options.live_port is not None:
-        _tell(f"live view: rerun --connect rerun+http://127.0.0.1:{options.live_port}/proxy")
     # Rerun's own log lines come from other threads, right through the table; what they say we find out ourselves.
     os.environ.setdefault("RUST_LOG", "off")
-    landing = "stopping: the vehicle lands and gets its parameters back; Ctrl-C again leaves it as it is"
-    with interrupts.caught(lambda: _tell(landing) if args.connect else None):
-        with _progress_bar() as progress:
-            result = run_scenario(scenario, options, _telling_of_compiling(progress))
+
+    def begin() -> None:
+        if options.live_port is not None:
+            _tell(f"live view: rerun --connect rerun+http://127.0.0.1:{options.live_port}/proxy")
+        _tell_of_compiling()
+
+    watch = RunWatch(begin)
+
+    def stopping() -> None:
+        if args.connect and watch.touched:
+            _tell("stopping: the vehicle lands and gets its parameters back; Ctrl-C again leaves it as it is")
+
+    with interrupts.caught(stopping):
+        with _progress_bar() as watch.show:
+            result = run_scenario(scenario, options, watch)
         return _report(args, result)
 
 

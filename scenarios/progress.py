@@ -9,7 +9,30 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from scenarios.runner import Progress
 
-PHASES = ("connect", "upload", "take off", "land", "restore")
+
+class RunWatch:
+    """Hands progress on and knows how far a run is.
+
+    Args:
+        begin: called once, when everything was found in order and the first flight begins.
+
+    Attributes:
+        show: where progress goes.
+        touched: a vehicle has been asked to change something.
+    """
+
+    def __init__(self, begin: Callable[[], object]) -> None:
+        self.show: Callable[[Progress], object] = lambda _: None
+        self.touched = False
+        self._begin: Callable[[], object] | None = begin
+
+    def __call__(self, now: Progress) -> None:
+        """Take the callback of `run_scenario`."""
+        if self._begin is not None:
+            begin, self._begin = self._begin, None
+            begin()
+        self.touched = self.touched or now.phase != "connect"
+        self.show(now)
 
 
 @contextmanager
