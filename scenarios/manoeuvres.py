@@ -284,6 +284,10 @@ def _check_edges(parts: Sequence[Part], keys: _Keys) -> None:
         if abs(edge * keys.rate_hz - round(edge * keys.rate_hz)) > 1e-6:
             remedy = f"Set-points are sent every {1 / keys.rate_hz:g} s: make every duration a multiple of it"
             raise keys.table.error("edge", f"{edge:g} s falls between two set-points", remedy)
+        if 0.0 < part.duration_s < 0.5 / keys.rate_hz:
+            # within rounding of the grid, and yet not one set-point long
+            remedy = f"Set-points are sent every {1 / keys.rate_hz:g} s"
+            raise keys.table.error("duration", f"a part of {part.duration_s:g} s holds no set-point", remedy)
     if edge > MAX_DURATION_S:
         raise keys.table.error("duration", f"{edge:g} s in all", f"At most {MAX_DURATION_S:g} s are flown")
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from scenarios.manoeuvres import KINDS, make_manoeuvre, parse_manoeuvres
@@ -176,6 +176,7 @@ def test_bad_lists_of_manoeuvres(tables: Any, text: str) -> None:
     assert text in str(error.value)
 
 
+@example({"amplitude_deg": 1.0, "hold_s": 6e-220, "return_s": 0.0})
 @given(st.dictionaries(st.sampled_from(["amplitude_deg", "hold_s", "return_s", "x"]), st.floats() | st.text()))
 def test_any_keys_make_a_safe_manoeuvre_or_a_file_error(keys: dict[str, Any]) -> None:
     try:
