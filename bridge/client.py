@@ -267,7 +267,7 @@ class Client:
         self.command(f"request of message {message_id}", CMD_REQUEST_MESSAGE, message_id)
 
     def set_mode(self, mode: Mode) -> None:
-        """Switch the flight mode and wait for the heartbeat that shows it.
+        """Ask for a flight mode; `state.nav_state` shows it with the vehicle's next CURRENT_MODE or HEARTBEAT.
 
         Raises:
             CommandRefused, PeerSilent.

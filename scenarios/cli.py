@@ -188,7 +188,6 @@ def _model(args: argparse.Namespace) -> int:
 
 def _scenario(args: argparse.Namespace) -> Scenario:
     from scenarios.scenario import load_scenario
-    from sitl.errors import UsageError
 
     scenario = load_scenario(args.scenario)
     changes: dict[str, Any] = {}
@@ -201,10 +200,16 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     if args.gains:
         changes["gain_sets"] = tuple(args.gains)
     if args.seed is not None:
-        if args.seed < 0:
-            raise UsageError(f"--seed {args.seed}: give 0 or more")
-        changes["seed"] = args.seed
+        changes["seed"] = _seed(args)
     return dataclasses.replace(scenario, **changes)
+
+
+def _seed(args: argparse.Namespace) -> int:
+    from sitl.errors import UsageError
+
+    if args.seed < 0:
+        raise UsageError(f"--seed {args.seed}: give 0 or more")
+    return int(args.seed)
 
 
 def _fly(args: argparse.Namespace) -> int:
@@ -338,8 +343,7 @@ def _sitl(args: argparse.Namespace) -> int:
     from sitl.vehicle_spec import DEFAULT_SCALING, resolve_vehicle
 
     clock = None
-    if args.seed < 0:
-        raise UsageError(f"--seed {args.seed}: give 0 or more")
+    seed = _seed(args)
     if args.speed != "max":
         try:
             clock = ScaledClock(float(args.speed))
@@ -347,7 +351,7 @@ def _sitl(args: argparse.Namespace) -> int:
             raise UsageError(f"--speed {args.speed}: give a number above 0, or 'max'") from None
     model = resolve_vehicle(args.spec, _words(args.scaling, DEFAULT_SCALING))
     _tell_of_compiling()
-    vehicle = Vehicle(model, get_profile(args.profile or "sitl"), seed=args.seed)
+    vehicle = Vehicle(model, get_profile(args.profile or "sitl"), seed=seed)
     links = open_links(args.link or default_urls(args.instance), instance=args.instance)
     terminal = sys.stderr is not None and sys.stderr.isatty()
     try:

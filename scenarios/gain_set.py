@@ -170,6 +170,36 @@ def _check_gain(gain_set: GainSet, name: str, value: float, maximum: float | Non
         raise _bad(gain_set, f"{name} = {value:g} is absurd{known}", remedy)
 
 
+def flight_gain_parameters(axis: str, gains: Mapping[str, float]) -> dict[str, float | int]:
+    """An airframe's flight gains as PX4 parameters.
+
+    Args:
+        axis: ROLL or PITCH.
+        gains: the fields of `sitl.airframe.FlightGains` by name.
+    """
+    return {
+        f"MC_{axis}_P": gains["k_phi"],
+        f"MC_{axis}RATE_K": 1.0,
+        f"MC_{axis}RATE_P": gains["kp"],
+        f"MC_{axis}RATE_I": gains["ki"],
+        f"MC_{axis}RATE_D": gains["kd"],
+        f"MC_{axis}RATE_FF": 0.0,
+    }
+
+
+def flies_gains(gain_set: GainSet, gains: Mapping[str, float]) -> bool:
+    """Does this set fly an airframe's flight gains on roll? What it does not name keeps PX4's default.
+
+    Args:
+        gain_set: the set. gains: the fields of `sitl.airframe.FlightGains` by name.
+    """
+    from sitl.parameters import parameter_specs
+
+    wanted = flight_gain_parameters("ROLL", gains)
+    flown = {name: gain_set.parameters.get(name, parameter_specs()[name].default) for name in wanted}
+    return flown == wanted
+
+
 def save_params(
     path: str | Path,
     parameters: Mapping[str, float | int],

@@ -78,6 +78,13 @@ class FlightJob:
     live_port: int | None = None
     patience_s: float = 5.0
 
+    def flown_table(self) -> ParameterTable:
+        """The airframe's parameters with this job's on top: what the vehicle holds in flight."""
+        table = ParameterTable(airframe_parameters(self.model, self.profile))
+        for name, (value, _) in self.parameters.items():
+            table.set(name, value)
+        return table
+
     @property
     def rows_per_batch(self) -> int:
         """Telemetry rows that are written together: few for eyes that watch or a link that may die, else many."""
@@ -234,18 +241,9 @@ class _Flight:
         self._stack.callback(link.close)
         files = self._files
         client = Client(link, drive, log=files.frame if files else None)
-        self._sampler = Sampler(
-            client, self._inverse(), files.rows if files else None, rows_per_batch=job.rows_per_batch
-        )
+        inverse = mix_of(job.flown_table()).inverse[:2]
+        self._sampler = Sampler(client, inverse, files.rows if files else None, rows_per_batch=job.rows_per_batch)
         return client
-
-    def _inverse(self) -> Any:
-        job = self._job
-        table = ParameterTable(airframe_parameters(job.model, job.profile))
-        for name, (value, _) in job.parameters.items():
-            if name.startswith("CA_"):
-                table.set(name, value)
-        return mix_of(table).inverse[:2]
 
     def _set_streams(self, client: Client) -> None:
         for message_id, interval_us in _INTERVALS_US.items():
@@ -348,9 +346,7 @@ class _Flight:
 
 def flown_margins(job: FlightJob) -> dict[str, Any]:
     """Margins of the roll loop with the gains and filters that this job flies (`sitl.stability.Margins`)."""
-    table = ParameterTable(airframe_parameters(job.model, job.profile))
-    for name, (value, _) in job.parameters.items():
-        table.set(name, value)
+    table = job.flown_table()
 
     def get(name: str) -> float:
         return float(table.get(name))

@@ -16,6 +16,7 @@ import numpy as np
 from bridge.client import Client
 from bridge.errors import CommandRefused
 from scenarios.flight import Segment
+from scenarios.limits import LIMIT_CYCLE_RAD_S
 from scenarios.manoeuvres import EPSILON_S, Manoeuvre
 from scenarios.metrics import DIVERGED_RAD
 from scenarios.sampler import CRUISE_INTERVAL_US, FAST_INTERVAL_US, SAMPLED
@@ -99,12 +100,9 @@ class Pilot:
                 self._sample_every(FAST_INTERVAL_US)
                 self._manoeuvre(manoeuvre)
                 self._sample_every(CRUISE_INTERVAL_US)
-        except FlightEndedError as end:
+        except (FlightEndedError, CommandRefused) as end:
             self.log.failure = str(end)
             self._say(2, f"flight ended: {end}")
-        except CommandRefused as refusal:
-            self.log.failure = str(refusal)
-            self._say(2, f"flight ended: {refusal}")
         finally:
             self._client.background = None
             self._watching = False
@@ -317,9 +315,8 @@ class Pilot:
 
     def _shaking(self) -> str:
         rates = self._client.state.rates
-        if rates is None or max(abs(rate) for rate in rates) < 0.3:
-            return ""
-        return f" (shaking: rates up to {max(abs(rate) for rate in rates):.1f} rad/s)"
+        fastest = max(abs(rate) for rate in rates) if rates else 0.0
+        return "" if fastest < LIMIT_CYCLE_RAD_S else f" (shaking: rates up to {fastest:.1f} rad/s)"
 
     def _last_words(self) -> str:
         texts = self._client.state.texts

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import get_context
 from pathlib import Path
@@ -15,11 +15,10 @@ from pathlib import Path
 from bridge.clock import utc_stamp
 from scenarios import interrupts
 from scenarios.flight import FlightRecord, RunRecord
-from scenarios.gain_set import GainSet, check, load_all
+from scenarios.gain_set import GainSet, check, flies_gains, flight_gain_parameters, load_all
 from scenarios.one_flight import MEMORY, FlightJob, FlightStoppedError, fly
 from scenarios.run_folder import RunFolder, vehicle_description
 from scenarios.scenario import Scenario
-from sitl.airframe import FlightGains
 from sitl.errors import FroudeError, LinkError, UsageError
 from sitl.parameters import ParameterTable, ParameterType
 from sitl.profile import Profile
@@ -190,7 +189,7 @@ def plan(gain_set: GainSet, scenario: Scenario, model: VehicleModel, profile: Pr
     if scenario.axes == "both":
         values.update(gain_set.mirrored().parameters)
     elif own is not None:
-        values.update(_gains("PITCH", own))
+        values.update(flight_gain_parameters("PITCH", asdict(own)))
     else:
         warnings.append(f"{model.airframe.name} has no flight gains of its own: pitch flies PX4's defaults")
     values.update(gain_set.parameters)
@@ -200,17 +199,6 @@ def plan(gain_set: GainSet, scenario: Scenario, model: VehicleModel, profile: Pr
     return FlightJob(gain_set, typed, scenario, model, profile, tuple(warnings))
 
 
-def _gains(axis: str, gains: FlightGains) -> dict[str, float | int]:
-    return {
-        f"MC_{axis}_P": gains.k_phi,
-        f"MC_{axis}RATE_K": 1.0,
-        f"MC_{axis}RATE_P": gains.kp,
-        f"MC_{axis}RATE_I": gains.ki,
-        f"MC_{axis}RATE_D": gains.kd,
-        f"MC_{axis}RATE_FF": 0.0,
-    }
-
-
 def _baseline(
     gain_sets: Sequence[GainSet], scenario: Scenario, model: VehicleModel, profile: Profile
 ) -> FlightJob | None:
@@ -218,14 +206,9 @@ def _baseline(
     own = model.airframe.flight_gains
     if own is None:
         return None
-    wanted = _gains("ROLL", own)
-    defaults = ParameterTable()
-
-    def flies_own(gain_set: GainSet) -> bool:
-        return all(gain_set.parameters.get(name, defaults.get(name)) == value for name, value in wanted.items())
-
-    if any(flies_own(gain_set) for gain_set in gain_sets):
+    if any(flies_gains(gain_set, asdict(own)) for gain_set in gain_sets):
         return None
+    wanted = flight_gain_parameters("ROLL", asdict(own))
     gain_set = GainSet(f"own {model.airframe.name}", wanted, "the airframe's own flight gains", "baseline")
     while gain_set.slug in {other.slug for other in gain_sets}:  # a candidate's files must stay the candidate's
         gain_set = replace(gain_set, name=f"{gain_set.name} baseline")

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from scenarios.flight import FlightRecord, RunRecord
+from scenarios.gain_set import flies_gains
 from scenarios.limits import LIMIT_CYCLE_RAD_S, Outcome
 
 UNSET = "–"
@@ -77,14 +78,6 @@ COLUMNS: tuple[TableColumn, ...] = (
     TableColumn("delay/margin", "ms", ("delay_margin_s",), _fixed(1, 1000.0)),
 )
 
-OWN_GAINS: Mapping[str, str] = {
-    "k_phi": "MC_ROLL_P",
-    "kp": "MC_ROLLRATE_P",
-    "ki": "MC_ROLLRATE_I",
-    "kd": "MC_ROLLRATE_D",
-}
-"""Names of an airframe's flight gains, and the parameters that carry them."""
-
 STYLES: Mapping[Outcome, str] = {
     Outcome.PASS: "green",
     Outcome.FAIL: "red",
@@ -134,13 +127,7 @@ def own_flight(run: RunRecord) -> FlightRecord | None:
     own = run.vehicle.get("flight_gains")
     if run.baseline is not None or not own:
         return run.baseline
-    wanted = {parameter: own[key] for key, parameter in OWN_GAINS.items()}
-    for flight in run.flights:
-        flown = flight.gain_set.parameters
-        neutral = flown.get("MC_ROLLRATE_K", 1.0) == 1.0 and flown.get("MC_ROLLRATE_FF", 0.0) == 0.0
-        if neutral and all(flown.get(name) == value for name, value in wanted.items()):
-            return flight
-    return None
+    return next((flight for flight in run.flights if flies_gains(flight.gain_set, own)), None)
 
 
 def own_gains_fly(flight: FlightRecord) -> bool | None:

@@ -51,9 +51,7 @@ class Autopilot:
 
     def __init__(self, parameters: ParameterTable, profile: Profile, plant: Plant, sensors: Sensors) -> None:
         self.parameters = parameters
-        self._profile = profile
         self._plant = plant
-        self._sensors = sensors
         self._revision = parameters.revision
         self.control = FlightControl(parameters, profile, plant, sensors)
         self.land_detector = LandDetector()

@@ -14,9 +14,7 @@ import numpy as np
 from sitl.filters import constrain
 from sitl.modes import Mode, Severity, Text
 from sitl.parameters import ParameterTable
-from sitl.position_control import POSITION_INPUT
-
-_G = 9.80665
+from sitl.position_control import ONE_G_M_S2, POSITION_INPUT
 
 
 class TakeoffState(Enum):
@@ -190,7 +188,7 @@ class Navigator:
         if self._ramp >= 1.0:
             self.state = TakeoffState.FLIGHT
             return climb
-        start = _G / max(0.01, self._get("MPC_Z_VEL_P_ACC"))
+        start = ONE_G_M_S2 / max(0.01, self._get("MPC_Z_VEL_P_ACC"))
         ramped = start + self._ramp * (climb - start)
         self.descending = ramped > 0.0
         return ramped

@@ -56,7 +56,8 @@ POSITION_STATE = np.dtype(
     align=True,
 )
 
-_G = 9.80665
+ONE_G_M_S2 = 9.80665
+"""PX4's gravity, which its position controller and take-off ramp reckon with."""
 
 
 @compiled
@@ -97,12 +98,12 @@ def _thrust(s: Record, state: Record) -> tuple[float, float, float]:
     """NED thrust vector (up is negative) for the wanted acceleration, tilt limited."""
     ax, ay, az = state.acc_sp[0], state.acc_sp[1], state.acc_sp[2]
     side = math.sqrt(ax * ax + ay * ay)
-    tilt = min(math.atan2(side, _G), s.tilt_max)
+    tilt = min(math.atan2(side, ONE_G_M_S2), s.tilt_max)
     bx, by = 0.0, 0.0
     if side > 0.0:
         bx, by = -ax / side * math.sin(tilt), -ay / side * math.sin(tilt)
     bz = math.cos(tilt)
-    collective = min((az * s.hover_thrust / _G - s.hover_thrust) / bz, -s.thr_min)
+    collective = min((az * s.hover_thrust / ONE_G_M_S2 - s.hover_thrust) / bz, -s.thr_min)
     return bx * collective, by * collective, bz * collective
 
 
@@ -144,7 +145,7 @@ def position_tick(
         # a speed asked for by itself may pass the limit: the take-off ramp starts from one that means no thrust
         state.vel_sp[2] = constrain(state.vel_sp[2], -s.vel_up_max, s.vel_down_max)
     error = np.empty(3)
-    state.vel_int[2] = constrain(state.vel_int[2], -_G, _G)
+    state.vel_int[2] = constrain(state.vel_int[2], -ONE_G_M_S2, ONE_G_M_S2)
     for i in range(3):
         error[i] = state.vel_sp[i] - velocity[i]
         state.acc_sp[i] = s.vel_p[i] * error[i] + state.vel_int[i] - s.vel_d[i] * state.vel_dot[i]
@@ -164,7 +165,7 @@ def position_tick(
     side_max = math.sqrt(max(0.0, s.thr_max**2 - tz**2))
     if side > side_max:
         tx, ty = tx / side * side_max, ty / side * side_max
-    got_x, got_y = tx * _G / s.hover_thrust, ty * _G / s.hover_thrust
+    got_x, got_y = tx * ONE_G_M_S2 / s.hover_thrust, ty * ONE_G_M_S2 / s.hover_thrust
     if s.vel_p[0] > 0.0 and state.acc_sp[0] ** 2 + state.acc_sp[1] ** 2 > got_x**2 + got_y**2:
         error[0] -= 2.0 / s.vel_p[0] * (state.acc_sp[0] - got_x)
         error[1] -= 2.0 / s.vel_p[1] * (state.acc_sp[1] - got_y)

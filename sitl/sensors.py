@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl.compiled import compiled
-from sitl.plant import G_M_S2, Plant
+from sitl.plant import Plant
 from sitl.profile import Profile
 from sitl.rotation import to_body
 
@@ -146,6 +146,3 @@ class Sensors:
     def pressure(self) -> float:
         """Static pressure, hPa."""
         return pressure_hpa(ORIGIN[2] - float(self._plant.x[2])) + float(self._noise[self._row % _BLOCK, 9])
-
-
-__all__ = ["G_M_S2", "ORIGIN", "Gps", "Sensors", "geodetic", "pressure_hpa"]
