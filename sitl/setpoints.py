@@ -30,3 +30,41 @@ class PositionSetpoint(NamedTuple):
     yaw: float
     yaw_rate: float
     serial: int
+
+
+class Sticks(NamedTuple):
+    """Where a pilot's sticks are, each -1..1: roll right, pitch forward (nose down), yaw right, throttle up."""
+
+    roll: float = 0.0
+    pitch: float = 0.0
+    yaw: float = 0.0
+    throttle: float = 0.0
+
+
+class PositionRequest(NamedTuple):
+    """A set-point from outside for Offboard, NED; NaN where an axis is left free.
+
+    Attributes:
+        position_ned: m, from where the vehicle booted. velocity_ned: m/s. acceleration_ned: m/s^2.
+        yaw: heading, rad. yaw_rate: rad/s.
+    """
+
+    position_ned: tuple[float, float, float]
+    velocity_ned: tuple[float, float, float]
+    acceleration_ned: tuple[float, float, float]
+    yaw: float
+    yaw_rate: float
+
+
+class Reposition(NamedTuple):
+    """Where Hold is asked to go; NaN keeps what is.
+
+    Attributes:
+        lat_deg, lon_deg: place, deg. alt_m: above mean sea level, m. yaw: rad. speed_m_s: cruise speed.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+    yaw: float
+    speed_m_s: float
