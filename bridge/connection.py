@@ -6,8 +6,8 @@
         for message in connection.receive(data):
             print(message.name, message.sysid, message.fields())
 
-One Connection for each link: it counts the packets of that link, both ways. What goes out is MAVLink 2,
-unsigned.
+One Connection for each link: it counts the packets of that link, both ways. What goes out is MAVLink 2, signed
+where the connection has a signer; then only frames it vouches for come in.
 """
 
 from __future__ import annotations
@@ -18,13 +18,15 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from bridge.framing import Counters, FrameSplitter, crc16
-from bridge.messages import BY_ID, BY_NAME, MAGIC_2, Message
+from bridge.messages import BY_ID, BY_NAME, MAGIC_2, SIGNATURE, SIGNED, Message
+from bridge.signing import Signer
 from sitl.errors import UsageError
 
 __all__ = ["Connection", "Counters", "Message"]
 
 _HEADER = struct.Struct("<6B3s")
 _MAGIC = bytes([MAGIC_2])
+_SETUP_SIGNING_ID = BY_NAME["SETUP_SIGNING"].id_bytes
 
 
 class Connection:
@@ -35,17 +37,19 @@ class Connection:
         compid: our component id, 1 to 255.
         datagram: every `receive` is a datagram of its own (`Link.datagram`), so that a damaged one never
             reaches into the next.
+        signer: signs what goes out and verifies what comes in; None: neither.
 
     Attributes:
         counters: what became of the bytes and frames received.
         sent: frames encoded.
-        on_frame: called with every frame, encoded or received, for a log of both directions.
+        on_frame: called with every frame, encoded or received, for a log of both directions: without signatures,
+            which an attacker could collect, and not with a SETUP_SIGNING, which holds the key.
 
     Raises:
         UsageError: an id outside 1 to 255.
     """
 
-    def __init__(self, sysid: int, compid: int, *, datagram: bool = False) -> None:
+    def __init__(self, sysid: int, compid: int, *, datagram: bool = False, signer: Signer | None = None) -> None:
         for what, value in (("system", sysid), ("component", compid)):
             if not 1 <= value <= 255:
                 raise UsageError(f"MAVLink {what} id {value}: choose one from 1 to 255")
@@ -55,6 +59,16 @@ class Connection:
         self.sent = 0
         self.on_frame: Callable[[bytes], object] | None = None
         self._splitter = FrameSplitter(BY_ID, self.counters, datagram=datagram)
+        self.signer = signer
+
+    @property
+    def signer(self) -> Signer | None:
+        """Signs what goes out and verifies what comes in; may be exchanged between two messages."""
+        return self._signer
+
+    @signer.setter
+    def signer(self, signer: Signer | None) -> None:
+        self._signer = self._splitter.signer = signer
 
     @property
     def pending(self) -> int:
@@ -84,11 +98,16 @@ class Connection:
         # MAVLink 2 cuts the zeros off the end but keeps one byte.
         payload = kind.pack(fields)
         payload = payload.rstrip(b"\0") or payload[:1]
-        body = _HEADER.pack(len(payload), 0, 0, self.sent & 0xFF, self.sysid, self.compid, kind.id_bytes) + payload
+        signer = self._signer
+        flags = 0 if signer is None else signer.flags
+        seq = self.sent & 0xFF
+        body = _HEADER.pack(len(payload), flags, 0, seq, self.sysid, self.compid, kind.id_bytes) + payload
         frame = _MAGIC + body + crc16(body + kind.crc_extra).to_bytes(2, "little")
+        if signer is not None and flags:
+            frame += signer.signature(frame)
         self.sent += 1
         if self.on_frame is not None:
-            self.on_frame(frame)
+            self._log(frame)
         return frame
 
     def receive(self, data: bytes) -> list[Message]:
@@ -103,5 +122,15 @@ class Connection:
     def _logged(self, messages: list[Message]) -> list[Message]:
         if self.on_frame is not None:
             for message in messages:
-                self.on_frame(message.raw_frame)
+                self._log(message.raw_frame)
         return messages
+
+    def _log(self, frame: bytes) -> None:
+        """Give a frame to the log as MAVLink's page on message signing wants it logged."""
+        if self.on_frame is None or (frame[0] == MAGIC_2 and frame[7:10] == _SETUP_SIGNING_ID):
+            return
+        if frame[0] == MAGIC_2 and frame[2] & SIGNED:
+            body = frame[1:2] + b"\0" + frame[3 : -SIGNATURE - 2]
+            kind = BY_ID[int.from_bytes(frame[7:10], "little")]
+            frame = _MAGIC + body + crc16(body + kind.crc_extra).to_bytes(2, "little")
+        self.on_frame(frame)

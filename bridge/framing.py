@@ -13,6 +13,8 @@ frames are read; a frame with incompatibility flags we do not know is none. How 
   can so hold back what follows for no longer than its own message, and `flush` decides on what there is.
 - What is kept between calls is bounded: an unfinished frame, at most behind one unknown one (`BUFFER_LIMIT`
   bytes).
+- **A whole frame that its signature does not vouch for** is refused and counted, and nothing inside it is looked at:
+  it costs no more than itself, and tells nothing of the packet counters.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from bridge.messages import (
     Message,
     MessageType,
 )
+from bridge.signing import Signer, Verdict
 
 # CRC-16/MCRF4XX of the bytes, optionally going on from an earlier checksum.
 crc16: Callable[..., int] = fastcrc.crc16.mcrf4xx
@@ -57,14 +60,36 @@ class Counters:
         resyncs: times a good frame was found again behind bad bytes.
         lost: frames missing from the senders' packet counters.
         late: frames that came twice or were overtaken (an overtaken one was counted as lost before).
+        bad_signature: frames signed with another key, or damaged in their signature. Only links with a `Signer`
+            count these and the two below; what they count is not received.
+        replayed: frames with a genuine signature whose timestamp is not new.
+        unsigned_refused: frames without a signature where one is required.
     """
 
-    __slots__ = ("_last", "bad_bytes", "bad_crc", "late", "lost", "received", "resyncs", "unknown")
+    __slots__ = (
+        "_last",
+        "bad_bytes",
+        "bad_crc",
+        "bad_signature",
+        "late",
+        "lost",
+        "received",
+        "replayed",
+        "resyncs",
+        "unknown",
+        "unsigned_refused",
+    )
 
     def __init__(self) -> None:
         self.received = self.bad_crc = self.unknown = self.bad_bytes = 0
         self.resyncs = self.lost = self.late = 0
+        self.bad_signature = self.replayed = self.unsigned_refused = 0
         self._last: dict[int, int] = {}
+
+    @property
+    def refused(self) -> int:
+        """Frames that were whole and not believed."""
+        return self.bad_signature + self.replayed + self.unsigned_refused
 
     def heard(self, sysid: int, compid: int, seq: int) -> None:
         """Follow the packet counter of one sender."""
@@ -105,12 +130,16 @@ class FrameSplitter:
         types: the messages that can be checked, by id.
         counters: where to count.
         datagram: every `feed` is a datagram of its own.
+
+    Attributes:
+        signer: verifies what comes in; None: signatures are skipped.
     """
 
     def __init__(self, types: Mapping[int, MessageType], counters: Counters, *, datagram: bool) -> None:
         self._types = types
         self._counters = counters
         self._datagram = datagram
+        self.signer: Signer | None = None
         self._rest = b""
         self._adrift = False
 
@@ -130,6 +159,9 @@ class FrameSplitter:
                 and len(data) == stop + 2
                 and crc16(data[1:stop] + kind.crc_extra) == data[stop] | data[stop + 1] << 8
             ):
+                if self.signer is not None and not self.signer.accepts_unsigned(kind.id):
+                    self._counters.unsigned_refused += 1
+                    return []
                 self._counters.received += 1
                 self._counters.heard(data[5], data[6], data[4])
                 return [Message(kind, data, HEADER_2, stop, data[5])]
@@ -155,11 +187,34 @@ class FrameSplitter:
             if self._adrift:
                 self._counters.resyncs += 1
                 self._adrift = False
+            end = settled + len(message.raw_frame)
+            if self.signer is not None:
+                verdict = self._judge(self.signer, message)
+                if verdict is not Verdict.GENUINE:
+                    # Where a byte of the signature got lost, the next frame begins in what was taken for its end.
+                    if verdict is Verdict.FORGED and end < len(buffer) and buffer[end] not in (MAGIC_1, MAGIC_2):
+                        end -= SIGNATURE
+                    settled = end
+                    continue
             self._counters.received += 1
             self._counters.heard(message.sysid, message.compid, message.seq)
             found.append(message)
-            settled += len(message.raw_frame)
+            settled = end
         return found
+
+    def _judge(self, signer: Signer, message: Message) -> Verdict | None:
+        """Return whether a frame is to be believed, None for one without a signature it needs; count it if not."""
+        if not message.signed:
+            if signer.accepts_unsigned(message.id):
+                return Verdict.GENUINE
+            self._counters.unsigned_refused += 1
+            return None
+        verdict = signer.verify(message.raw_frame)
+        if verdict is Verdict.FORGED:
+            self._counters.bad_signature += 1
+        elif verdict is Verdict.REPLAYED:
+            self._counters.replayed += 1
+        return verdict
 
     def _search(self, buffer: bytes, settled: int, final: bool) -> tuple[Message | None, int]:
         """Return the next good frame after `settled`, where there is none, and where it begins.

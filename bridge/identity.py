@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from enum import IntFlag
 
-from bridge.px4_modes import PX4_MODES
+from bridge.px4_modes import PX4_MODES, Px4Mode
 from bridge.telemetry import Fields, Source
-from sitl.modes import AVAILABLE
+from sitl.modes import EXTERNAL_MODES, Mode
 
 
 class Capability(IntFlag):
-    """MAV_PROTOCOL_CAPABILITY bits; those this vehicle really has are in CAPABILITIES."""
+    """MAV_PROTOCOL_CAPABILITY bits; this vehicle has all of these."""
 
     MISSION_FLOAT = 1
     PARAM_FLOAT = 2
@@ -31,14 +31,7 @@ class Capability(IntFlag):
     MISSION_RALLY = 32768
 
 
-CAPABILITIES = (
-    Capability.PARAM_FLOAT
-    | Capability.COMMAND_INT
-    | Capability.PARAM_ENCODE_BYTEWISE
-    | Capability.SET_ATTITUDE_TARGET
-    | Capability.FLIGHT_TERMINATION
-    | Capability.MAVLINK2
-)
+CAPABILITIES = Capability(sum(Capability))
 
 # The autopilot whose behaviour is copied, not this package's version: ground stations choose their parameter
 # descriptions by it. major << 24 | minor << 16 | patch << 8 | 255 for a release.
@@ -46,6 +39,8 @@ PX4_VERSION = 1 << 24 | 17 << 16 | 0 << 8 | 255
 
 _UID = 0x46524F554445_0000  # "FROUDE": no hardware behind it
 _PROTOCOL = 200
+_UNLISTED = (Mode.DESCEND,)  # ground stations see Land
+_NOT_SELECTABLE = 2
 
 
 def autopilot_version(source: Source, _: int) -> list[Fields]:
@@ -73,27 +68,57 @@ def flight_information(source: Source, _: int) -> list[Fields]:
 
 
 def available_modes(_: Source, index: int) -> list[Fields]:
-    """AVAILABLE_MODES (435): the modes this vehicle flies; index 0 = all of them, from 1 one of them."""
-    modes = [PX4_MODES[mode.value] for mode in AVAILABLE]
+    """AVAILABLE_MODES (435): index 0 = all of them, from 1 one of them; external modes are places nobody has taken."""
+    modes = [PX4_MODES[number] for number in sorted(PX4_MODES) if number not in _UNLISTED]
     return [
         {
             "number_modes": len(modes),
             "mode_index": number,
             "standard_mode": mode.standard_mode,
             "custom_mode": mode.custom_mode,
-            "properties": mode.properties,
-            # Standard modes are named by the ground station, in its user's language.
-            "mode_name": "" if mode.standard_mode else mode.name,
+            "properties": _NOT_SELECTABLE if mode.nav_state in EXTERNAL_MODES else mode.properties,
+            "mode_name": _mode_name(mode),
         }
         for number, mode in enumerate(modes, start=1)
         if index in (0, number)
     ]
 
 
+def _mode_name(mode: Px4Mode) -> str:
+    """Standard modes are named by the ground station, in its user's language."""
+    if mode.standard_mode:
+        return ""
+    return "(Mode not available)" if mode.nav_state in EXTERNAL_MODES else mode.name
+
+
+def component_metadata(source: Source, _: int) -> list[Fields]:
+    """COMPONENT_METADATA (397): where the list of metadata files is."""
+    if source.metadata is None:
+        return []
+    crc, uri = source.metadata.general_crc, source.metadata.general_uri
+    return [{"time_boot_ms": source.time_ms, "file_crc": crc, "uri": uri}]
+
+
+def component_information(source: Source, _: int) -> list[Fields]:
+    """COMPONENT_INFORMATION (395): the same, as older ground stations ask for it."""
+    if source.metadata is None:
+        return []
+    crc, uri = source.metadata.general_crc, source.metadata.general_uri
+    return [{"time_boot_ms": source.time_ms, "general_metadata_file_crc": crc, "general_metadata_uri": uri}]
+
+
+def storage_information(source: Source, _: int) -> list[Fields]:
+    """STORAGE_INFORMATION (261): one place for logs; its size is that of the computer and not told."""
+    return [{"time_boot_ms": source.time_ms, "storage_id": 1, "storage_count": 1, "status": 2}]
+
+
 REQUESTED: dict[int, tuple[str, Callable[[Source, int], list[Fields]]]] = {
     148: ("AUTOPILOT_VERSION", autopilot_version),
+    261: ("STORAGE_INFORMATION", storage_information),
     264: ("FLIGHT_INFORMATION", flight_information),
     300: ("PROTOCOL_VERSION", protocol_version),
+    395: ("COMPONENT_INFORMATION", component_information),
+    397: ("COMPONENT_METADATA", component_metadata),
     435: ("AVAILABLE_MODES", available_modes),
 }
 """Name and maker of each message that is only sent on request; the maker takes REQUEST_MESSAGE's param2."""

@@ -5,6 +5,7 @@
     udpin://127.0.0.1:14550                 listen; answer whoever spoke last
     udpout://127.0.0.1:14550                speak to this address
     udpout://127.0.0.1:14550?local=18570    ... from this local port, as PX4 does
+    udpout://127.0.0.1:14550?local=18570&bind=0.0.0.0   ... and other computers may speak to that port
     tcpin://127.0.0.1:4560                  listen; one peer at a time
     tcpout://127.0.0.1:4560                 connect
     serial:///dev/ttyACM0:921600            a serial port
@@ -14,6 +15,7 @@ An empty host is the loopback; IPv6 hosts stand in brackets. `memory://` has no 
 
 from __future__ import annotations
 
+import ipaddress
 import math
 from abc import ABC, abstractmethod
 from collections import deque
@@ -46,6 +48,8 @@ class Link(ABC):
         name: the address, for messages.
         datagram: True when one `recv` is one `send` of the peer, so that frames never straddle two of them.
         dropped: how many `send`s reached nobody.
+        strangers: datagrams ignored because their sender may not speak here.
+        exposed: the local (host, port) at which other computers can speak to it, None if none can.
     """
 
     datagram: ClassVar[bool] = True
@@ -53,6 +57,12 @@ class Link(ABC):
     def __init__(self, name: str) -> None:
         self.name = name
         self.dropped = 0
+        self.strangers = 0
+        self.exposed: tuple[str, int] | None = None
+
+    def fileno(self) -> int:
+        """Return the one file descriptor that becomes readable when `recv` has something, -1 if there is none."""
+        return -1
 
     @abstractmethod
     def send(self, data: bytes) -> None:
@@ -268,7 +278,7 @@ def open_link(url: str, *, connect_s: float = 3.0) -> Link:
     if parts.scheme == "udpout":
         from bridge.udp_link import UdpLink
 
-        return UdpLink.to(*_address(url, parts), local_port=_local_port(url, parts))
+        return UdpLink.to(*_address(url, parts), local_port=_local_port(url, parts), bind_host=_bind_host(url, parts))
     if parts.scheme == "tcpin":
         from bridge.tcp_link import TcpLink
 
@@ -308,8 +318,8 @@ def _address(url: str, parts: SplitResult) -> tuple[str, int]:
     if parts.path not in ("", "/") or parts.username is not None:
         raise LinkUrlError(url, "there is more in it than host and port", remedy)
     options = {key for key, _ in parse_qsl(parts.query, keep_blank_values=True)}
-    for option in sorted(options - {"local"} if parts.scheme == "udpout" else options):
-        raise LinkUrlError(url, f"unknown option {option!r}", "Only udpout takes one: ?local=port")
+    for option in sorted(options - {"local", "bind"} if parts.scheme == "udpout" else options):
+        raise LinkUrlError(url, f"unknown option {option!r}", "Only udpout takes any: ?local=port&bind=address")
     return parts.hostname or LOOPBACK, port
 
 
@@ -320,6 +330,20 @@ def _local_port(url: str, parts: SplitResult) -> int | None:
     if not (text.isascii() and text.isdigit() and 0 < int(text) < 65536):
         raise LinkUrlError(url, f"local={text!r} is not a port", "Write ?local= and a number from 1 to 65535")
     return int(text)
+
+
+def _bind_host(url: str, parts: SplitResult) -> str | None:
+    options = dict(parse_qsl(parts.query, keep_blank_values=True))
+    text = options.get("bind")
+    if text is None:
+        return None
+    if "local" not in options:
+        raise LinkUrlError(url, "bind without local", "Write ?local=port&bind=address")
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        raise LinkUrlError(url, f"bind={text!r} is not an address", "Write &bind=0.0.0.0, or an address") from None
+    return text
 
 
 def _device(url: str, parts: SplitResult) -> tuple[str, int]:

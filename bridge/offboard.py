@@ -1,7 +1,7 @@
-"""Offboard set-points from the wire to the autopilot: SET_ATTITUDE_TARGET and its masks.
+"""Offboard set-points from the wire to the autopilot: attitudes, rates, positions, velocities, accelerations.
 
-PX4 src/modules/mavlink/mavlink_receiver.cpp, handle_message_set_attitude_target. Position set-points are not
-flown; whoever sends them is told.
+PX4 src/modules/mavlink/mavlink_receiver.cpp, handle_message_set_attitude_target and
+handle_message_set_position_target_*.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from sitl.modes import Severity
+from sitl.sensors import local_position
+from sitl.setpoints import PositionRequest
 
 if TYPE_CHECKING:
     from bridge.vehicle_server import ServerLink, VehicleServer
@@ -18,6 +20,12 @@ if TYPE_CHECKING:
 _IGNORE_ROLL_RATE, _IGNORE_PITCH_RATE, _IGNORE_YAW_RATE = 1, 2, 4
 _THRUST_BODY, _IGNORE_THRUST, _IGNORE_ATTITUDE = 32, 64, 128
 """ATTITUDE_TARGET_TYPEMASK bits."""
+
+_FORCE, _IGNORE_YAW, _IGNORE_TURN = 512, 1024, 2048
+"""POSITION_TARGET_TYPEMASK bits beside the three for each of position (1), velocity (8) and acceleration (64)."""
+
+_LOCAL_NED, _BODY_NED = 1, 8
+_AMSL_FRAMES, _RELATIVE_FRAMES = (0, 5), (3, 6)
 
 
 class OffboardSetpoints:
@@ -34,9 +42,12 @@ class OffboardSetpoints:
         """Return the handler of each message."""
         return {
             "SET_ATTITUDE_TARGET": self._attitude,
-            "SET_POSITION_TARGET_LOCAL_NED": self._position,
-            "SET_POSITION_TARGET_GLOBAL_INT": self._position,
+            "SET_POSITION_TARGET_LOCAL_NED": self._local,
+            "SET_POSITION_TARGET_GLOBAL_INT": self._global,
         }
+
+    def _wanted(self, msg: Any) -> bool:
+        return self._server.is_for_us(msg) and bool(self._server.vehicle.parameters.get("MAV_FWDEXTSP"))
 
     def _attitude(self, _: ServerLink, msg: Any) -> None:
         """Pass a set-point on if it is a whole one: an attitude, or at least roll and pitch rate.
@@ -45,7 +56,7 @@ class OffboardSetpoints:
         loses control.)
         """
         server = self._server
-        if not server.is_for_us(msg) or not server.vehicle.parameters.get("MAV_FWDEXTSP"):
+        if not self._wanted(msg):
             return
         mask = msg.type_mask
         quat: tuple[float, float, float, float] | None = None if mask & _IGNORE_ATTITUDE else tuple(msg.q)
@@ -64,18 +75,83 @@ class OffboardSetpoints:
             thrust = abs(msg.thrust)
         problem = _problem(quat, rates, thrust, mask)
         if problem:
-            server.refused += 1
+            server.refusals += 1
             server.say_at_times(Severity.WARNING, problem, f"SET_ATTITUDE_TARGET ignored: {problem}")
             return
         server.vehicle.autopilot.offboard_attitude(quat, rates, thrust)
-        server.source.offboard_attitude = quat is not None
 
-    def _position(self, _: ServerLink, msg: Any) -> None:
-        server = self._server
-        if server.is_for_us(msg):
-            server.refused += 1
-            text = "Position set-points are not flown by this vehicle: send attitudes or rates"
-            server.say_at_times(Severity.WARNING, "position", text)
+    def _local(self, _: ServerLink, msg: Any) -> None:
+        """SET_POSITION_TARGET_LOCAL_NED; in the body's frame x and y turn with the heading."""
+        if not self._wanted(msg):
+            return
+        frame = msg.coordinate_frame
+        if frame not in (_LOCAL_NED, _BODY_NED):
+            self._refuse(msg, f"coordinate frame {frame} unsupported")
+            return
+        position = _axes(msg, ("x", "y", "z"), 1)
+        velocity = _axes(msg, ("vx", "vy", "vz"), 8)
+        acceleration = _axes(msg, ("afx", "afy", "afz"), 64)
+        if frame == _BODY_NED:
+            heading = self._server.vehicle.estimate.euler()[2]
+            position = (math.nan, math.nan, math.nan)  # a place relative to a moving body is none
+            velocity, acceleration = _turned(velocity, heading), _turned(acceleration, heading)
+        self._pass_on(msg, position, velocity, acceleration)
+
+    def _global(self, _: ServerLink, msg: Any) -> None:
+        """SET_POSITION_TARGET_GLOBAL_INT: degrees x 1e7, height above sea level or home."""
+        if not self._wanted(msg):
+            return
+        frame, vehicle = msg.coordinate_frame, self._server.vehicle
+        if frame not in _AMSL_FRAMES + _RELATIVE_FRAMES:
+            self._refuse(msg, f"coordinate frame {frame} unsupported")
+            return
+        home = vehicle.autopilot.home
+        base_m = home.alt_m if frame in _RELATIVE_FRAMES and home is not None else 0.0
+        north, east, down = local_position(msg.lat_int * 1e-7, msg.lon_int * 1e-7, base_m + msg.alt)
+        mask = msg.type_mask
+        position = (
+            math.nan if mask & 1 else north,
+            math.nan if mask & 2 else east,
+            math.nan if mask & 4 else down,
+        )
+        self._pass_on(msg, position, _axes(msg, ("vx", "vy", "vz"), 8), _axes(msg, ("afx", "afy", "afz"), 64))
+
+    def _pass_on(
+        self,
+        msg: Any,
+        position: tuple[float, float, float],
+        velocity: tuple[float, float, float],
+        acceleration: tuple[float, float, float],
+    ) -> None:
+        mask = msg.type_mask
+        finite = any(math.isfinite(value) for value in (*position, *velocity, *acceleration))
+        if not finite or mask & _FORCE:
+            self._refuse(msg, "invalid")
+            return
+        yaw = math.nan if mask & _IGNORE_YAW else msg.yaw
+        yaw_rate = math.nan if mask & _IGNORE_TURN else msg.yaw_rate
+        request = PositionRequest(position, velocity, acceleration, yaw, yaw_rate)
+        self._server.vehicle.autopilot.offboard_position(request)
+
+    def _refuse(self, msg: Any, problem: str) -> None:
+        self._server.refusals += 1
+        self._server.say_at_times(Severity.CRITICAL, msg.name, f"{msg.name} {problem}\t")
+
+
+def _axes(msg: Any, names: tuple[str, str, str], first_bit: int) -> tuple[float, float, float]:
+    """Return three fields, NaN where the mask says ignore or where they are no finite numbers."""
+    x, y, z = (
+        value if not msg.type_mask & first_bit << k and math.isfinite(value) else math.nan
+        for k, value in enumerate(getattr(msg, name) for name in names)
+    )
+    return x, y, z
+
+
+def _turned(vector: tuple[float, float, float], heading: float) -> tuple[float, float, float]:
+    """Return a forward-right-down vector as north-east-down. heading: rad."""
+    forward, right, down = vector
+    c, s = math.cos(heading), math.sin(heading)
+    return forward * c - right * s, forward * s + right * c, down
 
 
 def _problem(quat: Sequence[float] | None, rates: Sequence[float], thrust: float, mask: int) -> str:

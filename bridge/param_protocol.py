@@ -33,8 +33,8 @@ TYPE_UINT32: Final = 5
 TYPE_NUMBERS: Final[dict[ParameterType, int]] = {"INT32": 6, "REAL32": 9}
 """MAV_PARAM_TYPE of the two types PX4 has."""
 
-BURST_PERIOD_US: Final = 10_000
-"""Time between two bursts of the list on one link, us."""
+BURST_PERIOD_US: Final = 4_000
+"""Time between two bursts of the list on one link, us; PX4 takes 10 ms for as many."""
 
 ANNOUNCE_DELAY_US: Final = 20_000
 """Time from a change to its announcement, us; PX4 takes 10 to 500 ms."""
@@ -91,6 +91,9 @@ class ParamServer:
         table: the vehicle's parameters; changes made to it by anybody are announced on every link.
         system_id: own system.
         component_id: own component; requests to it or to component 0 are answered.
+
+    Attributes:
+        refused: requests that were answered with a PARAM_ERROR.
     """
 
     HANDLES: Final = frozenset(("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET"))
@@ -99,6 +102,7 @@ class ParamServer:
         self.table = table
         self.system_id = system_id
         self.component_id = component_id
+        self.refused = 0
         self._links: dict[int, _LinkState] = {}
         self._notices: deque[str] = deque(maxlen=64)
 
@@ -107,12 +111,12 @@ class ParamServer:
 
         Args:
             link_id: any number the caller keeps for the link.
-            burst: most messages per 10 ms; PX4 sends 20 over UDP, TCP and USB and 3 over a UART.
+            burst: most messages per 4 ms; 20 is PX4's number over UDP, TCP and USB.
         """
         self._links[link_id] = _LinkState(burst, self.table.revision)
 
-    def remove_link(self, link_id: int) -> None:
-        """Forget a link that was closed; whatever it was still owed is dropped."""
+    def forget(self, link_id: int) -> None:
+        """Drop whatever a link is still owed: its peer is gone, or it was closed."""
         self._links.pop(link_id, None)
 
     def take_notices(self) -> list[str]:
@@ -161,7 +165,7 @@ class ParamServer:
             return []
         if now_us < link.due_us:
             return []
-        # keep the 10 ms grid whatever the tick, but never catch up on bursts that were missed
+        # keep the grid whatever the tick, but never catch up on bursts that were missed
         link.due_us = max(link.due_us + BURST_PERIOD_US, now_us + BURST_PERIOD_US // 2)
         if link.list_index is not None:
             return self._list_burst(link, link.list_index)
@@ -244,6 +248,7 @@ class ParamServer:
         }
 
     def _error(self, msg: Message, error: ParamError, index: int = 0) -> Outgoing:
+        self.refused += 1
         return "PARAM_ERROR", {
             "target_system": msg.sysid,
             "target_component": msg.compid,

@@ -77,6 +77,7 @@ PX4_MODES: dict[int, Px4Mode] = {
         Px4Mode(19, MAIN_AUTO, 8, "Follow Target", _BY_SETPOINTS),
         Px4Mode(20, MAIN_AUTO, 9, "Precision Landing", _BY_ITSELF),
         Px4Mode(21, MAIN_POSITION, 1, "Orbit", _BY_SETPOINTS, 2),
+        Px4Mode(22, MAIN_AUTO, 10, "VTOL Takeoff", _BY_ITSELF),
         *(Px4Mode(23 + i, MAIN_AUTO, 11 + i, f"External {i + 1}", _BY_SETPOINTS) for i in range(8)),
         # Descend has no number of its own: ground stations see Land, which therefore comes first here.
         Px4Mode(12, MAIN_AUTO, 6, "Descend", _BY_ITSELF, 7),
@@ -89,8 +90,8 @@ OFFBOARD = 14
 _ASKED: dict[tuple[int, int], int] = {
     (mode.main, mode.sub): mode.nav_state
     for mode in PX4_MODES.values()
-    # Termination, Orbit and Descend cannot be asked for with DO_SET_MODE.
-    if mode.nav_state not in (12, 13, 21)
+    # Descend, Termination, Orbit and VTOL Takeoff cannot be asked for with DO_SET_MODE.
+    if mode.nav_state not in (12, 13, 21, 22)
 }
 _MAINS = {main for main, _ in _ASKED}
 

@@ -67,3 +67,8 @@ class SerialLink(Link):
         if self._port is not None:
             self._port.close()
             self._port = None
+
+
+def is_usb(link: Link) -> bool:
+    """Return whether a link is a serial line over USB, as Linux names those of flight controllers."""
+    return isinstance(link, SerialLink) and "ttyACM" in link.name

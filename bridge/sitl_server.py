@@ -1,140 +1,195 @@
-"""Vehicles for any ground station: on PX4's own ports, in real time, slower, faster, or as fast as it goes.
+"""Vehicles for any ground station: on PX4's own ports, each made from what the user asked for.
 
-    links = open_links(default_urls(instance=0), instance=0)
-    serve(vehicle, links, ScaledClock(1.0), stop=stop)
+    options = SitlOptions(seed=1)
+    servers = [build_vehicle("ant-x", 0, options), build_vehicle("ant-r", 1, options)]
+    Fleet(servers, ScaledClock(1.0), close=close_vehicle).run(stop=stop)
 
-Instance i is system i + 1 and speaks from PX4's ports: to the ground station at 127.0.0.1:14550 from
-18570 + i and to programs (MAVSDK) at 127.0.0.1:14540 + i from 14580 + i. It speaks first.
+Instance i is system i + 1 and speaks from PX4's ports (`bridge.sitl_links`). It speaks first.
 """
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import dataclasses
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from types import FrameType
-from typing import get_args
+from pathlib import Path
 
-from bridge.clock import Clock, ScaledClock, WallClock, utc_us
-from bridge.connection import Connection
-from bridge.errors import LinkUrlError
-from bridge.link import LOOPBACK, open_link
-from bridge.px4_modes import PX4_MODES
-from bridge.streams import LinkMode
+from bridge.clock import Clock, ScaledClock, utc_us
+from bridge.fleet import Fleet, stop_on_signals
+from bridge.fleet_status import FleetStatus
+from bridge.key_file import load_key
+from bridge.link import LOOPBACK
+from bridge.services import VehicleFiles
+from bridge.sitl_links import banner, close_links, default_urls, link_urls, open_links
 from bridge.vehicle_server import ServerLink, VehicleServer
-from sitl.errors import UsageError
+from sitl.errors import FileError, UsageError
+from sitl.profile import get_profile
 from sitl.vehicle import Vehicle
+from sitl.vehicle_spec import DEFAULT_SCALING, VehicleModel, resolve_vehicle
 
-LAST_INSTANCE = 249
-"""System ids end at 250."""
+__all__ = [
+    "SitlOptions",
+    "banner",
+    "build_fleet",
+    "build_vehicle",
+    "check_files",
+    "close_links",
+    "close_vehicle",
+    "default_urls",
+    "expand_specs",
+    "open_links",
+    "refuses_unsigned",
+    "serve",
+    "stop_on_signals",
+]
 
-_GCS_PORT, _GCS_LOCAL = 14550, 18570
-_API_PORT, _API_LOCAL, _LAST_API_PORT = 14540, 14580, 14549
-_LISTEN_US = 1_000
-_TOO_LATE_US = 100_000
-_REPORT_US = 1_000_000
-
-
-def default_urls(instance: int = 0) -> tuple[str, ...]:
-    """Return the link addresses of a vehicle as PX4's simulator uses them.
-
-    Raises:
-        UsageError: no such instance.
-    """
-    if not 0 <= instance <= LAST_INSTANCE:
-        raise UsageError(f"--instance {instance}: choose one from 0 to {LAST_INSTANCE}")
-    api_port = min(_API_PORT + instance, _LAST_API_PORT)
-    return (
-        f"udpout://{LOOPBACK}:{_GCS_PORT}?local={_GCS_LOCAL + instance}#gcs",
-        f"udpout://{LOOPBACK}:{api_port}?local={_API_LOCAL + instance}#onboard",
-    )
-
-
-def open_links(urls: Sequence[str], *, instance: int = 0) -> list[ServerLink]:
-    """Open a vehicle's links; all are closed again if one cannot be opened.
-
-    Args:
-        urls: addresses as `bridge.link` reads them; `#onboard` at the end gives a link the stream rates of a
-            companion computer, `#gcs`, the default, those of a ground station.
-        instance: 0 is system 1.
-
-    Raises:
-        LinkUrlError: an address that cannot be read.
-        PortBusy: another program holds a port.
-    """
-    links: list[ServerLink] = []
-    try:
-        for number, url in enumerate(urls):
-            address, mode = _split_mode(url)
-            link = open_link(address)
-            connection = Connection(instance + 1, 1, datagram=link.datagram)
-            links.append(ServerLink(link, connection, number, mode))
-    except BaseException:
-        close_links(links)
-        raise
-    return links
-
-
-def close_links(links: Sequence[ServerLink]) -> None:
-    """Release every port."""
-    for link in links:
-        link.link.close()
-
-
-def banner(title: str, links: Sequence[ServerLink]) -> str:
-    """Return the line that says who is served where."""
-    names = {"gcs": "ground station", "onboard": "MAVSDK and other programs", "memory": "this program"}
-    where = ", ".join(f"{names[link.mode]} at {link.link.name}" for link in links)
-    sysid = links[0].connection.sysid if links else 0
-    return f"{title} is system {sysid}, serving {where or 'nobody'}"
+_MOST_VEHICLES = 255
+_REPEATED = re.compile(r"(.+)\*(\d+)", re.DOTALL)
 
 
 @dataclass(frozen=True)
-class Status:
-    """One second of serving.
+class SitlOptions:
+    """What all vehicles of a fleet have in common.
 
     Attributes:
-        vehicle_s: vehicle time in seconds.
-        speed: vehicle seconds per wall second, achieved since the last status.
-        asked_speed: what was asked for, None for as fast as possible.
-        mode, armed: what the vehicle does.
-        sent, received: messages so far, all links together.
-        damaged: bytes received that were no message, so far.
-        refused: messages for this vehicle that made no sense, so far.
-        defects: bugs hit so far.
+        profile: name of the fidelity profile.
+        scaling: words of Froude scaling, for specs that are scaled.
+        seed: of sensor noise; among several vehicles instance i uses seed + i.
+        bind: the address of this computer that PX4's ports are opened on.
+        links: addresses instead of PX4's ports; a number with +i behind it grows by the instance.
+        state: file that keeps parameters across restarts; None keeps none.
+        log_dir: folder of flight logs; None writes none.
+        signing_key: file of the MAVLink 2 signing key, the same for all vehicles; None does not sign.
+        several: whether there is more than one vehicle, so that each needs files of its own.
     """
 
-    vehicle_s: float
-    speed: float
-    asked_speed: float | None
-    mode: str
-    armed: bool
-    sent: int
-    received: int
-    damaged: int
-    refused: int
-    defects: int
+    profile: str = "sitl"
+    scaling: tuple[str, ...] = DEFAULT_SCALING
+    seed: int = 0
+    bind: str = LOOPBACK
+    links: tuple[str, ...] = ()
+    state: Path | None = None
+    log_dir: Path | None = None
+    signing_key: Path | None = None
+    several: bool = False
 
-    def line(self) -> str:
-        """Return it as one line for people; trouble is named only where there is some."""
-        parts = [
-            f"{self.vehicle_s:8.1f} s",
-            f"{self.speed:.2f} x",
-            f"{self.mode}{', armed' if self.armed else ''}",
-            f"sent {self.sent}",
-            f"received {self.received}",
-        ]
-        if self.asked_speed is not None and self.speed < 0.95 * self.asked_speed:
-            parts[1] += f" (too slow for {self.asked_speed:g} x)"
-        for what, count in (
-            ("damaged bytes", self.damaged),
-            ("refused", self.refused),
-            ("defects", self.defects),
-        ):
-            if count:
-                parts.append(f"{what} {count}")
-        return "  ".join(parts)
+    def of_instance(self, instance: int) -> SitlOptions:
+        """Return the options of one vehicle: its own seed, link addresses and, among several, files.
+
+        `FILE.params` becomes `FILE.2.params` for instance 2, and the folder of logs `DIR/2`.
+        """
+        seed, state, log_dir = self.seed, self.state, self.log_dir
+        if self.several:
+            seed += instance
+            state = None if state is None else state.with_name(f"{state.stem}.{instance}{state.suffix}")
+            log_dir = None if log_dir is None else log_dir / str(instance)
+        return dataclasses.replace(
+            self,
+            seed=seed,
+            links=link_urls(instance, bind=self.bind, given=self.links),
+            state=state,
+            log_dir=log_dir,
+        )
+
+
+def expand_specs(words: Sequence[str]) -> list[str]:
+    """Return one vehicle spec for each vehicle: `ant-x*3` is three of them.
+
+    Raises:
+        UsageError: a count of 0, or more vehicles than MAVLink has system ids.
+    """
+    specs: list[str] = []
+    for word in words:
+        match = None if Path(word).is_file() else _REPEATED.fullmatch(word)
+        spec, count = (match[1], int(match[2])) if match else (word, 1)
+        if not 1 <= count <= _MOST_VEHICLES:
+            raise UsageError(f"{word}: {count} vehicles; give a number from 1 to {_MOST_VEHICLES}")
+        specs += [spec] * count
+    if len(specs) > _MOST_VEHICLES:
+        raise UsageError(f"{len(specs)} vehicles: MAVLink has system ids for {_MOST_VEHICLES}")
+    return specs
+
+
+def check_files(options: SitlOptions) -> None:
+    """Refuse files that cannot be used: better now than at the end of a flight.
+
+    Raises:
+        FileError: which of them, and why: a signing key must be readable by its owner only.
+    """
+    if options.state is not None:
+        if options.state.is_dir():
+            raise FileError(options.state, "is a folder", "Give --state a file")
+        if not options.state.parent.is_dir():
+            raise FileError(options.state, "its folder does not exist", "Make the folder, or write --state elsewhere")
+    if options.log_dir is not None:
+        if options.log_dir.exists() and not options.log_dir.is_dir():
+            raise FileError(options.log_dir, "is not a folder", "Give --log-dir a folder")
+        if not options.log_dir.exists() and not options.log_dir.parent.is_dir():
+            raise FileError(options.log_dir, "its parent folder does not exist", "Make that, or choose another one")
+    key = options.signing_key
+    if key is not None:
+        if not key.is_file():
+            raise FileError(key, "no such key file", "--signing-key needs a file with the key in it")
+        load_key(key, may_be_missing=True)
+
+
+def build_vehicle(spec: str | VehicleModel, instance: int, options: SitlOptions) -> VehicleServer:
+    """Make one vehicle with its links and services; `close_vehicle` and `close_links` undo it.
+
+    Args:
+        spec: airframe or reference:target, or the model itself.
+        instance: 0 is system 1.
+        options: of the fleet.
+
+    Raises:
+        UsageError: no such vehicle or profile.
+        FileError: a file of the vehicle cannot be used.
+        LinkError: a port is busy, a peer does not answer.
+    """
+    own = options.of_instance(instance)
+    model = resolve_vehicle(spec, own.scaling) if isinstance(spec, str) else spec
+    vehicle = Vehicle(model, get_profile(own.profile), seed=own.seed)
+    links = open_links(own.links, instance=instance)
+    files = VehicleFiles(logs=own.log_dir, parameters=own.state, signing_key=own.signing_key)
+    try:
+        return _server(vehicle, links, files)
+    except BaseException:
+        close_links(links)
+        raise
+
+
+def build_fleet(specs: Sequence[str | VehicleModel], first: int, options: SitlOptions) -> list[VehicleServer]:
+    """Make one vehicle for each spec, with instances from `first` on; none is left half made.
+
+    Raises:
+        UsageError, FileError, LinkError: as `build_vehicle`; the vehicles made before are closed again.
+    """
+    servers: list[VehicleServer] = []
+    try:
+        for instance, spec in enumerate(specs, start=first):
+            servers.append(build_vehicle(spec, instance, options))
+    except BaseException:
+        for server in servers:
+            close_vehicle(server)
+            close_links(server.links)
+        raise
+    return servers
+
+
+def refuses_unsigned(server: VehicleServer) -> bool:
+    """Return whether a vehicle obeys only messages that are signed with its key, on every link."""
+    keyed = all(link.connection.signer is not None for link in server.links)
+    return keyed and bool(server.vehicle.parameters.get("MAV_SIGN_CFG"))
+
+
+def close_vehicle(server: VehicleServer) -> None:
+    """Bring a vehicle's files to an end, in order; its links stay open.
+
+    Raises:
+        FileError: one of them cannot be written.
+    """
+    server.close()
 
 
 def serve(
@@ -143,17 +198,14 @@ def serve(
     clock: ScaledClock | None,
     *,
     stop: Callable[[], bool],
-    report: Callable[[Status], object] | None = None,
+    report: Callable[[FleetStatus], object] | None = None,
     wall: Clock | None = None,
 ) -> VehicleServer:
-    """Run a vehicle on its links until `stop` says so or a ground station shuts it down.
-
-    A machine that cannot keep up flies slower than asked and says so in the status: what is more than 0.1 s
-    late is not made up for.
+    """Run one vehicle on its links until `stop` says so or a ground station shuts it down; see `Fleet.run`.
 
     Args:
         vehicle: the vehicle.
-        links: see `open_links`; they stay open. The vehicle's MAV_SYS_ID becomes theirs.
+        links: see `open_links`. The vehicle's MAV_SYS_ID becomes theirs.
         clock: its speed; None for as fast as possible.
         stop: asked before every tick.
         report: gets a status once per wall second.
@@ -162,105 +214,12 @@ def serve(
     Returns:
         The server, with its counters.
     """
-    wall = wall or WallClock()
-    if links:
-        vehicle.parameters.set("MAV_SYS_ID", links[0].connection.sysid)
-    server = VehicleServer(vehicle, links, utc_boot_us=utc_us() - vehicle.time_us)
-    server.step()  # before the clock starts: the first tick loads the compiled laws
-    pace = None if clock is None else _Pace(clock, vehicle.time_us)
-    watch = _Watch(server, None if clock is None else clock.speed, wall)
-    while not (stop() or server.shutdown_asked):
-        if pace is not None:
-            while not pace.due(vehicle.time_us + vehicle.tick_us):
-                server.listen()
-        server.step()
-        if report is not None and vehicle.tick % _WATCH_TICKS == 0:
-            status = watch.look()
-            if status is not None:
-                report(status)
+    server = _server(vehicle, links)
+    Fleet([server], clock, wall=wall, close=close_vehicle).run(stop=stop, report=report)
     return server
 
 
-@contextmanager
-def stop_on_signals() -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C and SIGTERM end `serve` after the tick it is in; yields the `stop` to give to it."""
-    stopped = False
-
-    def stop(_number: int, _frame: FrameType | None) -> None:
-        nonlocal stopped
-        stopped = True
-
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: stopped
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-_WATCH_TICKS = 16
-
-
-class _Pace:
-    """Lets ticks happen when they are due on a clock."""
-
-    def __init__(self, clock: ScaledClock, vehicle_us: int) -> None:
-        self._clock = clock
-        self._slice_us = max(1, int(_LISTEN_US * clock.speed))
-        self._too_late_us = int(_TOO_LATE_US * clock.speed)
-        self._ahead_us = clock.now_us() - vehicle_us
-
-    def due(self, vehicle_us: int) -> bool:
-        """Return whether it is vehicle time `vehicle_us`; if not, wait for it, but at most a millisecond."""
-        remaining_us = vehicle_us + self._ahead_us - self._clock.now_us()
-        if remaining_us > 0:
-            self._clock.sleep_until_us(self._clock.now_us() + min(remaining_us, self._slice_us))
-            return remaining_us <= self._slice_us
-        if -remaining_us > self._too_late_us:
-            self._ahead_us -= remaining_us
-        return True
-
-
-class _Watch:
-    """Measures what `serve` achieves."""
-
-    def __init__(self, server: VehicleServer, asked_speed: float | None, wall: Clock) -> None:
-        self._server = server
-        self._asked_speed = asked_speed
-        self._wall = wall
-        self._wall_us = wall.now_us()
-        self._vehicle_us = server.vehicle.time_us
-
-    def look(self) -> Status | None:
-        """Return a status if a second has passed since the last one."""
-        wall_us = self._wall.now_us()
-        passed_us = wall_us - self._wall_us
-        if passed_us < _REPORT_US:
-            return None
-        server, autopilot = self._server, self._server.vehicle.autopilot
-        vehicle_us = server.vehicle.time_us
-        speed = (vehicle_us - self._vehicle_us) / passed_us
-        self._wall_us, self._vehicle_us = wall_us, vehicle_us
-        connections = [link.connection for link in server.links]
-        return Status(
-            vehicle_s=vehicle_us * 1e-6,
-            speed=speed,
-            asked_speed=self._asked_speed,
-            mode=PX4_MODES[autopilot.mode].name,
-            armed=autopilot.armed,
-            sent=sum(connection.sent for connection in connections),
-            received=sum(connection.counters.received for connection in connections),
-            damaged=sum(connection.counters.bad_bytes for connection in connections),
-            refused=server.refused,
-            defects=server.defects,
-        )
-
-
-def _split_mode(url: str) -> tuple[str, LinkMode]:
-    """Return (address, mode) of an address with `#mode` at its end."""
-    address, _, mode = url.partition("#")
-    choices: tuple[LinkMode, ...] = get_args(LinkMode)
-    for choice in choices:
-        if choice == (mode or "gcs"):
-            return address, choice
-    raise LinkUrlError(url, f"unknown stream rates {mode!r}", "Write #gcs or #onboard, or neither")
+def _server(vehicle: Vehicle, links: Sequence[ServerLink], files: VehicleFiles | None = None) -> VehicleServer:
+    if links:
+        vehicle.parameters.set("MAV_SYS_ID", links[0].connection.sysid)
+    return VehicleServer(vehicle, links, utc_boot_us=utc_us() - vehicle.time_us, files=files or VehicleFiles())

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from bridge import sensor_telemetry, telemetry
+from bridge import sensor_telemetry, status_telemetry, telemetry
 from bridge.telemetry import Fields, Source
 
 LinkMode = Literal["gcs", "onboard", "memory"]
@@ -86,6 +86,14 @@ STREAMS: dict[int, Stream] = {
         Stream(26, "SCALED_IMU", sensor_telemetry.scaled_imu),
         Stream(375, "ACTUATOR_OUTPUT_STATUS", sensor_telemetry.actuator_output_status),
         Stream(115, "HIL_STATE_QUATERNION", sensor_telemetry.hil_state_quaternion),
+        Stream(8, "LINK_NODE_STATUS", status_telemetry.link_node_status),
+        Stream(65, "RC_CHANNELS", status_telemetry.rc_channels),
+        Stream(87, "POSITION_TARGET_GLOBAL_INT", status_telemetry.position_target_global_int),
+        Stream(290, "ESC_INFO", status_telemetry.esc_info),
+        Stream(291, "ESC_STATUS", status_telemetry.esc_status),
+        Stream(380, "TIME_ESTIMATE_TO_TARGET", status_telemetry.time_estimate_to_target),
+        Stream(12901, "OPEN_DRONE_ID_LOCATION", status_telemetry.open_drone_id_location),
+        Stream(12904, "OPEN_DRONE_ID_SYSTEM", status_telemetry.open_drone_id_system),
     )
 }
 """Every message this vehicle can stream, by id."""
@@ -98,18 +106,26 @@ _NORMAL_HZ: dict[str, float] = {
     "ATTITUDE_TARGET": 2,
     "BATTERY_STATUS": 0.5,
     "CURRENT_MODE": 0.5,
+    "ESC_INFO": 1,
+    "ESC_STATUS": 1,
     "ESTIMATOR_STATUS": 0.5,
     "EXTENDED_SYS_STATE": 1,
     "GLOBAL_POSITION_INT": 5,
     "GPS_GLOBAL_ORIGIN": 1,
     "GPS_RAW_INT": 5,
     "HOME_POSITION": 0.5,
+    "LINK_NODE_STATUS": 1,
     "LOCAL_POSITION_NED": 1,
+    "OPEN_DRONE_ID_LOCATION": 1,
+    "OPEN_DRONE_ID_SYSTEM": 1,
     "PING": 0.1,
+    "POSITION_TARGET_GLOBAL_INT": 1,
     "POSITION_TARGET_LOCAL_NED": 1.5,
+    "RC_CHANNELS": 5,
     "SCALED_PRESSURE": 1,
     "SERVO_OUTPUT_RAW": 1,
     "SYS_STATUS": 1,
+    "TIME_ESTIMATE_TO_TARGET": 0.5,
     "VFR_HUD": 4,
     "VIBRATION": 0.1,
 }
@@ -121,6 +137,8 @@ _ONBOARD_HZ: dict[str, float] = {
     "ATTITUDE_TARGET": 10,
     "BATTERY_STATUS": 0.5,
     "CURRENT_MODE": 0.5,
+    "ESC_INFO": 10,
+    "ESC_STATUS": 10,
     "ESTIMATOR_STATUS": 1,
     "EXTENDED_SYS_STATE": 5,
     "GLOBAL_POSITION_INT": 50,
@@ -128,19 +146,25 @@ _ONBOARD_HZ: dict[str, float] = {
     "GPS_RAW_INT": 10,
     "HIGHRES_IMU": 50,
     "HOME_POSITION": 0.5,
+    "LINK_NODE_STATUS": 1,
     "LOCAL_POSITION_NED": 30,
     "ODOMETRY": 30,
+    "OPEN_DRONE_ID_LOCATION": 1,
+    "OPEN_DRONE_ID_SYSTEM": 1,
     "PING": 1,
+    "POSITION_TARGET_GLOBAL_INT": 10,
     "POSITION_TARGET_LOCAL_NED": 10,
+    "RC_CHANNELS": 20,
     "SCALED_PRESSURE": 1,
     "SERVO_OUTPUT_RAW": 10,
     "SYSTEM_TIME": 1,
     "SYS_STATUS": 5,
     "TIMESYNC": 10,
+    "TIME_ESTIMATE_TO_TARGET": 0.5,
     "VFR_HUD": 10,
     "VIBRATION": 0.5,
 }
-_SIMULATOR_HZ: dict[str, float] = dict.fromkeys(
+_SIMULATOR_HZ: dict[str, float] = {"RC_CHANNELS": 20.0} | dict.fromkeys(
     (
         "ATTITUDE",
         "ATTITUDE_QUATERNION",
@@ -150,14 +174,17 @@ _SIMULATOR_HZ: dict[str, float] = dict.fromkeys(
         "POSITION_TARGET_LOCAL_NED",
         "SERVO_OUTPUT_RAW",
     ),
-    50,
+    50.0,
 )
 """What PX4's simulator raises on the ground station's link at start; interval 0 does not bring these back."""
+
+_UNWATCHED = ("ESC_INFO", "ESC_STATUS", "OPEN_DRONE_ID_LOCATION", "OPEN_DRONE_ID_SYSTEM", "POSITION_TARGET_GLOBAL_INT")
+"""What nobody looks at on the link between a runner and its own vehicle."""
 
 _DEFAULT_HZ: dict[LinkMode, dict[str, float]] = {
     "gcs": _NORMAL_HZ,
     "onboard": _ONBOARD_HZ,
-    "memory": _ONBOARD_HZ,
+    "memory": {name: hz for name, hz in _ONBOARD_HZ.items() if name not in _UNWATCHED},
 }
 _START_HZ: dict[LinkMode, dict[str, float]] = {**_DEFAULT_HZ, "gcs": _NORMAL_HZ | _SIMULATOR_HZ}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import select
 import socket
 
@@ -54,7 +55,11 @@ class TcpLink(Link):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         bind(url, sock, address)
         sock.listen(1)
-        return cls(f"tcpin://{host}:{sock.getsockname()[1]}", listener=sock, peer=None)
+        link = cls(f"tcpin://{host}:{sock.getsockname()[1]}", listener=sock, peer=None)
+        own = sock.getsockname()
+        if not ipaddress.ip_address(own[0].partition("%")[0]).is_loopback:
+            link.exposed = own[0], int(own[1])
+        return link
 
     @classmethod
     def connect(cls, host: str, port: int, *, limit_s: float = 3.0) -> TcpLink:

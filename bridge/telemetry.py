@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bridge.px4_modes import ARMED, CUSTOM, OFFBOARD, PX4_MODES
 from sitl.sensors import geodetic
 from sitl.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from bridge.vehicle_server import ServerLink
 
 Fields = dict[str, Any]
 
@@ -40,7 +43,10 @@ GYRO, ACCEL, MAG, BARO, GPS = 0x1, 0x2, 0x4, 0x8, 0x20
 ATTITUDE, XY_POSITION, MOTORS, AHRS, BATTERY = 0x800, 0x4000, 0x8000, 0x200000, 0x2000000
 PREARM_CHECK = 0x10000000
 """MAV_SYS_STATUS_SENSOR bits."""
-SENSORS = GYRO | ACCEL | MAG | BARO | GPS | ATTITUDE | XY_POSITION | MOTORS | AHRS | BATTERY
+RADIO, LOGGING = 0x10000, 0x1000000
+PRESENT = GYRO | ACCEL | MAG | BARO | GPS | XY_POSITION | MOTORS | LOGGING | BATTERY
+"""What a PX4 multicopter in simulation says it has; it expects a radio even when there is none."""
+HEALTHY = PRESENT | ATTITUDE | AHRS
 
 
 @dataclass
@@ -51,16 +57,21 @@ class Source:
         vehicle: the vehicle.
         sysid: its MAVLink system id.
         utc_boot_us: UTC of vehicle time zero in microseconds; 0 = unknown, SYSTEM_TIME is then not sent.
-        offboard_attitude: the last offboard set-point held an attitude, not only body rates.
         ping_seq: number of the last PING.
+        link: the link that the next message goes out on.
+        metadata: its component metadata, None for none.
+        channels: pulse widths of a radio's channels, us. channels_us: vehicle time they came, None before.
         mav_type: HEARTBEAT.type; the parameter MAV_TYPE as it was at start, as on a PX4.
     """
 
     vehicle: Vehicle
     sysid: int = 1
     utc_boot_us: int = 0
-    offboard_attitude: bool = False
     ping_seq: int = 0
+    link: ServerLink | None = None
+    channels: tuple[int, ...] = ()
+    metadata: Any = None
+    channels_us: int | None = None
     mav_type: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -82,7 +93,7 @@ class Source:
         """HEARTBEAT.base_mode as it is now."""
         autopilot = self.vehicle.autopilot
         flags = PX4_MODES[autopilot.mode].base_mode
-        if autopilot.mode == OFFBOARD and not self.offboard_attitude:
+        if autopilot.mode == OFFBOARD and not autopilot.offboard_levels:
             flags = CUSTOM
         return flags | ARMED if autopilot.armed else flags
 
@@ -146,9 +157,9 @@ def sys_status(source: Source) -> Fields:
     """SYS_STATUS: every sensor there and healthy; PREARM_CHECK, in health alone, says it may be armed."""
     battery = source.vehicle.battery()
     return {
-        "onboard_control_sensors_present": SENSORS,
-        "onboard_control_sensors_enabled": SENSORS,
-        "onboard_control_sensors_health": SENSORS | (PREARM_CHECK if source.vehicle.autopilot.ready else 0),
+        "onboard_control_sensors_present": PRESENT,
+        "onboard_control_sensors_enabled": PRESENT | RADIO,
+        "onboard_control_sensors_health": HEALTHY | (PREARM_CHECK if source.vehicle.autopilot.ready else 0),
         "load": _LOAD_PER_MILLE,
         "voltage_battery": uint16(battery.voltage_v * 1000.0),
         "current_battery": int16(battery.current_a * 100.0),

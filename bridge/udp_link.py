@@ -12,6 +12,7 @@ from bridge.errors import LinkClosed, LinkUrlError, PortBusy
 from bridge.link import Link
 
 _LARGEST = 65_535
+_STRANGERS_AT_ONCE = 64
 
 # (host, port) or, for IPv6, (host, port, flow, scope): the socket module's own shape.
 Address = tuple[Any, ...]
@@ -25,6 +26,9 @@ class UdpLink(Link):
     - `to`: speaks to one address from the first moment. With a local port it does as PX4 does: others may
       talk to that port and the latest of them is answered too, in addition to the fixed address, so neither a
       ground station that listens on the remote port nor a script that calls the local one waits in vain.
+      Where other computers can reach that port, the first of them to speak is the one that is heard and
+      answered from then on, as on a PX4; datagrams from any other computer are ignored and counted in
+      `strangers`.
 
     A peer that does not exist costs nothing but `dropped` (on loopback the system reports it, elsewhere it
     cannot).
@@ -36,7 +40,12 @@ class UdpLink(Link):
         self._socket: socket.socket | None = sock
         self._remote = remote
         self._open_port = open_port
+        self._own_host: str = sock.getsockname()[0]
+        if open_port and not _is_loopback(self._own_host):
+            self.exposed = self._own_host, int(sock.getsockname()[1])
         self._guest: Address | None = None
+        self._outsider: Address | None = None
+        self._peers: tuple[Address, ...] = () if remote is None else (remote,)
 
     @classmethod
     def listen(cls, host: str, port: int) -> UdpLink:
@@ -50,48 +59,64 @@ class UdpLink(Link):
         return cls(f"udpin://{host}:{sock.getsockname()[1]}", sock, None, open_port=True)
 
     @classmethod
-    def to(cls, host: str, port: int, *, local_port: int | None = None) -> UdpLink:
+    def to(cls, host: str, port: int, *, local_port: int | None = None, bind_host: str | None = None) -> UdpLink:
         """Speak to `host:port`, from `local_port` if given.
+
+        Args:
+            host: the remote address or name.
+            port: the remote port.
+            local_port: ours; None for any.
+            bind_host: the address of this computer that `local_port` is opened on. None is the loopback for a
+                remote address on the loopback, every address for others.
 
         Raises:
             PortBusy: another program holds the local port.
-            LinkUrlError: the host cannot be found.
+            LinkUrlError: the host cannot be found, or `bind_host` is not an address of this computer.
         """
         url = f"udpout://{host}:{port}"
         family, remote = resolve(url, host, port, socket.SOCK_DGRAM)
         if local_port is None:
             return cls(url, socket.socket(family, socket.SOCK_DGRAM), remote, open_port=False)
-        # A vehicle that speaks to this computer only is reachable from this computer only.
-        if ipaddress.ip_address(remote[0].partition("%")[0]).is_loopback:
+        url = f"{url}?local={local_port}"
+        if bind_host is not None:
+            own = bind_host
+            url = f"{url}&bind={bind_host}"
+            if (ipaddress.ip_address(own).version == 6) != (family == socket.AF_INET6):
+                raise LinkUrlError(url, f"{own} cannot speak to {remote[0]}", "Give both as IPv4 or both as IPv6")
+        elif _is_loopback(remote[0]):
+            # A vehicle that speaks to this computer only is reachable from this computer only.
             own = remote[0]
         else:
             own = "::" if family == socket.AF_INET6 else "0.0.0.0"
         sock, _ = _bound("udpout", own, local_port)
-        return cls(f"{url}?local={local_port}", sock, remote, open_port=True)
+        return cls(url, sock, remote, open_port=True)
 
     @property
     def port(self) -> int:
         """The local port."""
         return int(self._open().getsockname()[1])
 
+    def fileno(self) -> int:
+        """Return the socket's descriptor."""
+        return self._open().fileno()
+
     def send(self, data: bytes) -> None:
-        """Send one datagram to the remote address and to the guest, if there are any."""
+        """Send one datagram to the remote address and to the guests, if there are any."""
         sock = self._open()
-        if self._remote is None and self._guest is None:
+        if not self._peers:
             self.dropped += 1
-        for peer in (self._remote, self._guest):
-            if peer is not None:
-                try:
-                    sock.sendto(data, peer)
-                except OSError as error:
-                    self._count(error)
+        for peer in self._peers:
+            try:
+                sock.sendto(data, peer)
+            except OSError as error:
+                self._count(error)
 
     def recv(self, timeout_s: float = 0.0) -> bytes | None:
         """Return the next datagram from anybody who may speak here."""
         sock = self._open()
         if timeout_s > 0.0:
             select.select([sock], [], [], timeout_s)
-        while True:
+        for _ in range(_STRANGERS_AT_ONCE):
             try:
                 data, sender = sock.recvfrom(_LARGEST)
             except BlockingIOError:
@@ -99,12 +124,10 @@ class UdpLink(Link):
             except OSError as error:
                 self._count(error)
                 return None
-            if sender == self._remote:
+            if sender in self._peers or (self._open_port and self._admits(sender)):
                 return data
-            if self._open_port:
-                self._guest = sender
-                return data
-            # Somebody else found the port of a link that speaks to one address only.
+            self.strangers += 1
+        return None
 
     def close(self) -> None:
         """Release the port."""
@@ -116,6 +139,21 @@ class UdpLink(Link):
         if self._socket is None:
             raise LinkClosed(self.name)
         return self._socket
+
+    def _admits(self, sender: Address) -> bool:
+        """Return whether somebody new may speak here, and answer there from now on."""
+        if self.exposed is None or self._remote is None or _is_loopback(sender[0]):
+            self._guest = sender
+        elif sender[0] == self._own_host and sender[1] == self._remote[1] and _is_loopback(self._remote[0]):
+            # A ground station on this computer, called at its loopback address, answers our other address.
+            return True
+        elif self._outsider is None or self._outsider[0] == sender[0]:
+            self._outsider = sender
+        else:
+            return False
+        everybody = (self._remote, self._guest, self._outsider)
+        self._peers = tuple(peer for peer in everybody if peer is not None)
+        return True
 
     def _count(self, error: OSError) -> None:
         """Count what UDP reports about a datagram that went nowhere; anything else is a bug and goes up."""
@@ -134,7 +172,12 @@ _NOBODY_THERE = {
     errno.EAGAIN,
     errno.ENOBUFS,
     errno.EPERM,  # a firewall's answer to sendto
+    errno.EADDRNOTAVAIL,  # an interface that has gone, or one from which the loopback cannot be reached
 }
+
+
+def _is_loopback(host: str) -> bool:
+    return ipaddress.ip_address(host.partition("%")[0]).is_loopback
 
 
 def resolve(url: str, host: str, port: int, kind: socket.SocketKind) -> tuple[socket.AddressFamily, Address]:

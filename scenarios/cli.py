@@ -11,6 +11,8 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from scenarios import sitl_command
+
 if TYPE_CHECKING:
     from scenarios.runner import Progress, RunResult
     from scenarios.scenario import Scenario
@@ -75,13 +77,9 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--junit", type=Path, metavar="FILE", help="also write JUnit XML here")
     sub.add_argument("--gate", action="store_true", help="exit status 1 unless every set passes")
 
-    sub = add("sitl", _sitl, "Serve a simulated vehicle to any ground station.", "froude sitl ant-x --speed 2")
-    sub.add_argument("spec", help="airframe, or reference:target")
+    sub = add("sitl", _sitl, "Serve simulated vehicles to any ground station.", "froude sitl ant-x ant-r --speed 2")
+    sitl_command.add_arguments(sub)
     _vehicle_options(sub)
-    sub.add_argument("--link", action="append", metavar="URL", help="instead of PX4's ports; may be repeated")
-    sub.add_argument("--speed", default="1", metavar="X|max", help="vehicle seconds per second (default: 1)")
-    sub.add_argument("--instance", type=int, default=0, metavar="N", help="PX4's port and system id offset")
-    sub.add_argument("--seed", type=int, default=0, metavar="N", help="of sensor noise")
     return parser
 
 
@@ -335,41 +333,9 @@ def _progress_bar() -> AbstractContextManager[Callable[[Progress], object]]:
 
 
 def _sitl(args: argparse.Namespace) -> int:
-    from bridge.clock import ScaledClock
-    from bridge.sitl_server import banner, close_links, default_urls, open_links, serve, stop_on_signals
-    from sitl.errors import UsageError
-    from sitl.profile import get_profile
-    from sitl.vehicle import Vehicle
-    from sitl.vehicle_spec import DEFAULT_SCALING, resolve_vehicle
+    from sitl.vehicle_spec import DEFAULT_SCALING
 
-    clock = None
-    seed = _seed(args)
-    if args.speed != "max":
-        try:
-            clock = ScaledClock(float(args.speed))
-        except ValueError:
-            raise UsageError(f"--speed {args.speed}: give a number above 0, or 'max'") from None
-    model = resolve_vehicle(args.spec, _words(args.scaling, DEFAULT_SCALING))
-    _tell_of_compiling()
-    vehicle = Vehicle(model, get_profile(args.profile or "sitl"), seed=seed)
-    links = open_links(args.link or default_urls(args.instance), instance=args.instance)
-    terminal = sys.stderr is not None and sys.stderr.isatty()
-    try:
-        print(banner(model.name, links), flush=True)
-        print("Ctrl-C stops it.", flush=True)
-        with stop_on_signals() as stop:
-            serve(
-                vehicle,
-                links,
-                clock,
-                stop=stop,
-                report=(lambda s: print(f"\r{s.line()}\x1b[K", end="", file=sys.stderr)) if terminal else None,
-            )
-    finally:
-        close_links(links)
-    if terminal:
-        print(file=sys.stderr)
-    return EXIT_OK
+    return sitl_command.run(args, scaling=_words(args.scaling, DEFAULT_SCALING), seed=_seed(args), tell=_tell)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,15 @@ _AXES = (("ROLL", "RR"), ("PITCH", "PR"), ("YAW", "YR"))
 _STATUS_PERIOD_S = 0.005
 _LARGEST = 3.4e38
 """Stands for a limit that someone set to infinity: infinity means the study's loop, which has no limits at all."""
+
+
+def reader(parameters: ParameterTable) -> Callable[[str], float]:
+    """The value of a parameter by name, as a float."""
+
+    def get(name: str) -> float:
+        return float(parameters.get(name))
+
+    return get
 
 
 def mix_of(parameters: ParameterTable) -> Mix:

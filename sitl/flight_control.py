@@ -1,7 +1,7 @@
 """The fast half of the autopilot: set-points in, motor signals out, every tick.
 
-It owns the compiled loops and what they run on, and knows nothing of modes, arming or failsafes: `sitl.autopilot`
-tells it what to control. The position controller runs every 8 ms, on a velocity one tick old.
+It owns the compiled loops and what they run on, and knows nothing of arming or failsafes: `sitl.autopilot` tells it
+what to control and which mode to fly. The position controller runs every 8 ms, on a velocity one tick old.
 """
 
 from __future__ import annotations
@@ -14,16 +14,18 @@ from numpy.typing import NDArray
 from sitl import control_loop
 from sitl.control_loop import CONTROL_INPUT, CONTROL_SETTINGS, CONTROL_STATE, control_tick, settle_filters
 from sitl.control_settings import control_settings, mix_of, position_settings, position_ticks
+from sitl.guide import ATTITUDE_BY_STICK, Guide, flown_as
 from sitl.land_detector import LandDetector
-from sitl.modes import Mode
-from sitl.navigator import Navigator, TakeoffState
+from sitl.modes import Home, Mode, Text
 from sitl.parameters import ParameterTable
 from sitl.plant import Plant
 from sitl.position_control import POSITION_STATE, position_tick
 from sitl.profile import Profile
 from sitl.rotation import to_euler
 from sitl.sensors import Sensors
-from sitl.setpoints import AttitudeSetpoint, PositionSetpoint
+from sitl.setpoints import AttitudeSetpoint, PositionRequest, PositionSetpoint, Sticks
+from sitl.sticks import clean
+from sitl.takeoff import TakeoffState
 
 Quat = tuple[float, float, float, float]
 Vec3 = tuple[float, float, float]
@@ -40,8 +42,9 @@ class FlightControl:
 
     Attributes:
         state: (1,) of CONTROL_STATE.
-        navigator: where the modes that hold a position want to be.
+        navigator: where the guiding modes want to be. mission: what Mission flies.
         velocity: (3,) NED, m/s, of this tick.
+        sticks: where a pilot's sticks are; None if there are none, which counts as centred.
     """
 
     def __init__(self, parameters: ParameterTable, profile: Profile, plant: Plant, sensors: Sensors) -> None:
@@ -49,7 +52,11 @@ class FlightControl:
         self._profile = profile
         self._plant = plant
         self._sensors = sensors
-        self.navigator = Navigator(parameters)
+        self._guide = Guide(parameters)
+        self.navigator = self._guide.navigator
+        self.mission = self._guide.mission
+        self.sticks: Sticks | None = None
+        self._dt_s = 1.0 / profile.rate_hz
         self.state = np.zeros(1, CONTROL_STATE)
         self._settings: NDArray[np.void] = np.zeros(1, CONTROL_SETTINGS)
         self._input = np.zeros(1, CONTROL_INPUT)
@@ -125,6 +132,7 @@ class FlightControl:
             thrust: 0..1. fly: at once; otherwise it waits for `fly_setpoint`.
         """
         shown = quat if quat is not None else (1.0, 0.0, 0.0, 0.0)
+        self._guide.drop()
         self._attitude_sp = AttitudeSetpoint(now_us, shown, rates, thrust, self._attitude_sp.serial + 1)
         self._waiting_level = control_loop.RATES if quat is None else control_loop.ATTITUDE
         self._rates_sp[:] = rates
@@ -133,9 +141,25 @@ class FlightControl:
         if fly:
             self.fly_setpoint()
 
+    def take_position(self, now_us: int, request: PositionRequest, *, fly: bool) -> None:
+        """Take an external set-point of position, velocity or acceleration; `guide` flies it in Offboard.
+
+        Args:
+            now_us: vehicle time. request: NED. fly: at once; otherwise it waits for `fly_setpoint`.
+        """
+        if self._guide.take(request) and fly:
+            self.forget_position()
+
+    @property
+    def by_position(self) -> bool:
+        """Is the external set-point taken last one of position, velocity or acceleration?"""
+        return self._guide.request is not None
+
     def fly_setpoint(self) -> None:
         """Fly the external set-point taken last; without one hold still, without thrust."""
-        if self._waiting_level != control_loop.OFF:
+        if self._guide.request is not None:
+            self.forget_position()
+        elif self._waiting_level != control_loop.OFF:
             self._level[0] = self._waiting_level
             self._thrust_sp[0] = self._attitude_sp.thrust
         else:
@@ -146,11 +170,26 @@ class FlightControl:
     def forget_setpoint(self) -> None:
         """What an earlier Offboard was asked for counts no more."""
         self._waiting_level = control_loop.OFF
+        self._guide.request = None
+
+    def begin(self, now_us: int, mode: Mode, before: Mode, *, home: Home | None, landed: bool) -> None:
+        """A mode begins while armed; at arming `before` is the mode itself.
+
+        Args:
+            now_us: vehicle time. mode: to be flown from now on. before: flown until now.
+            home: where Return goes and heights are counted from. landed: from the land detector.
+        """
+        mode, before = flown_as(mode), flown_as(before)
+        stopped = self.stopped
+        place = self._plant.position_ned(), self._plant.velocity_ned(), self._yaw()
+        if self._guide.begin(mode, before, *place, home=home, landed=landed, stopped=stopped):
+            self.forget_position()
+        if mode is Mode.OFFBOARD and (stopped or self.by_position):
+            self.fly_setpoint()
 
     def begin_holding(self) -> None:
         """A mode that holds a position begins here."""
-        _, _, yaw = to_euler(tuple(self._plant.quat.tolist()))
-        self.navigator.enter(self._plant.position_ned(), self._plant.velocity_ned(), yaw)
+        self.navigator.enter(self._plant.position_ned(), self._plant.velocity_ned(), self._yaw())
 
     # -- every tick --------------------------------------------------------------------------------------------
 
@@ -162,31 +201,94 @@ class FlightControl:
         control_tick(self._settings, self._input, self.state, self._sensors.gyro, self._plant.quat)
         return self._outputs
 
-    def hold_position(self, now_us: int, mode: Mode, landing: LandDetector, home_down: float) -> None:
-        """Run the position controller if it is due; its set-point is flown from the next tick on.
+    def guide(self, now_us: int, mode: Mode, landing: LandDetector, home: Home | None) -> None:
+        """Let a mode choose the set-point that is flown from the next tick on.
 
         Args:
-            now_us: vehicle time. mode: one of POSITION_MODES. landing: is it on the ground?
-            home_down: height of home in the local frame, m (down).
+            now_us: vehicle time. mode: any but Offboard by attitude or rates. landing: is it on the ground?
+            home: where Return goes and heights are counted from.
         """
-        if self._ticks % self._position_ticks:
+        mode = flown_as(mode)
+        if mode in ATTITUDE_BY_STICK:
+            self._fly_sticks(now_us, mode, landing.landed)
             return
-        navigator, position = self.navigator, self._plant.position_ned()
-        self._tilt_max[0] = self._tilt_max_air if navigator.state is TakeoffState.FLIGHT else self._tilt_max_ground
-        navigator.update(now_us, self._position_dt_s, mode, position, landing.ground_contact, landing.landed, home_down)
+        if self._ticks % self._position_ticks or not self._guide.runs(mode):
+            return
+        flying = self.navigator.state is TakeoffState.FLIGHT
+        self._tilt_max[0] = self._tilt_max_air if flying else self._tilt_max_ground
+        self._guide.choose(
+            now_us,
+            self._position_dt_s,
+            mode,
+            self.sticks,
+            self._plant.position_ned(),
+            self._plant.velocity_ned(),
+            self._yaw(),
+            home=home,
+            ground_contact=landing.ground_contact,
+            landed=landing.landed,
+        )
+        self._run_position(now_us)
+
+    def hold_position(self, now_us: int, mode: Mode, landing: LandDetector, home_down: float) -> None:
+        """`guide` with no more of home than its height in the local frame, m (down)."""
+        self.guide(now_us, mode, landing, Home(0.0, 0.0, 0.0, (0.0, 0.0, home_down), (1.0, 0.0, 0.0, 0.0)))
+
+    def _yaw(self) -> float:
+        yaw: float = to_euler(tuple(self._plant.quat.tolist()))[2]
+        return yaw
+
+    def _run_position(self, now_us: int) -> None:
+        """Run the position controller and take what it wants."""
         position_tick(
-            self._position_settings, navigator.request, self._position_state, self._plant.position, self._velocity_late
+            self._position_settings,
+            self.navigator.request,
+            self._position_state,
+            self._plant.position,
+            self._velocity_late,
         )
         self._quat_sp[:] = self._held_quat
         thrust = float(self._held_thrust[0])
         self._thrust_sp[0] = thrust
-        self._yaw_rate_sp[0] = math.nan
+        self._yaw_rate_sp[0] = self.navigator.track.yaw_rate
         self._level[0] = control_loop.ATTITUDE
         w, x, y, z = self._held_quat.tolist()
         serial = self._attitude_sp.serial + 1
         self._attitude_sp = AttitudeSetpoint(now_us, (w, x, y, z), (0.0, 0.0, 0.0), thrust, serial)
 
+    def _fly_sticks(self, now_us: int, mode: Mode, landed: bool) -> None:
+        """Stabilized and Acro."""
+        sticks, law = clean(self.sticks), self._guide.by_stick
+        if mode is Mode.ACRO:
+            rates, thrust = law.rates(sticks)
+            self._level[0] = control_loop.RATES
+            self._rates_sp[:] = rates
+            quat = (1.0, 0.0, 0.0, 0.0)
+        else:
+            spooled_up = self.navigator.takeoff.spooled_up(now_us)
+            quat, rate, thrust = law.attitude(sticks, self._yaw(), self._dt_s, landed=landed, spooled_up=spooled_up)
+            rates = (0.0, 0.0, rate)
+            self._level[0] = control_loop.ATTITUDE
+            self._quat_sp[:] = quat
+            self._yaw_rate_sp[0] = rate or math.nan
+        self._thrust_sp[0] = thrust
+        self._attitude_sp = AttitudeSetpoint(now_us, quat, rates, thrust, self._attitude_sp.serial + 1)
+
     # -- what it shows -----------------------------------------------------------------------------------------
+
+    @property
+    def wish(self) -> Mode | None:
+        """The mode that what is flown wants next, until `begin` is told of another mode."""
+        return self._guide.wish(self._plant.position_ned()[2])
+
+    @property
+    def climb_controlled(self) -> bool:
+        """Does the mode that `begin` was told of control vertical speed?"""
+        return self._guide.climb_controlled
+
+    def take_texts(self) -> list[Text]:
+        """What mission and return have said since the last call."""
+        return self._guide.take_texts()
 
     @property
     def motors(self) -> tuple[float, ...]:
@@ -212,4 +314,5 @@ class FlightControl:
         vn, ve, vd = state["vel_sp"].tolist()
         an, ae, ad = state["acc_sp"].tolist()
         yaw = float(request["yaw_sp"]) if used else math.nan
-        return PositionSetpoint(now_us, (n, e, d), (vn, ve, vd), (an, ae, ad), yaw, math.nan, self._ticks)
+        rate = self.navigator.track.yaw_rate if used else math.nan
+        return PositionSetpoint(now_us, (n, e, d), (vn, ve, vd), (an, ae, ad), yaw, rate, self._ticks)

@@ -5,8 +5,10 @@ Source: PX4 ``commander`` (COM_DISARM_LAND, COM_DISARM_PRFLT).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
+from sitl.land_detector import LandLimits
 from sitl.parameters import ParameterTable
 
 _GRACE_S = 1.0
@@ -44,17 +46,30 @@ class LandingWatch:
             self._landed_us = None
             if not self._took_off:
                 self._took_off = True
-                yield "Takeoff detected"
+                yield "Takeoff detected\t"
         elif self._took_off:
             if self._landed_us is None:
                 self._landed_us = now_us
-                yield "Landing detected"
+                yield "Landing detected\t"
             if self._over("COM_DISARM_LAND", now_us - self._landed_us):
-                self.disarm = "Disarmed by landing"
+                self.disarm = "Disarmed by landing\t"
         elif self._over("COM_DISARM_PRFLT", now_us - self._armed_us - round(_GRACE_S * 1e6)):
-            self.disarm = "Disarmed by auto preflight disarming"
+            self.disarm = "Disarmed by auto preflight disarming\t"
 
     def _over(self, parameter: str, waited_us: int) -> bool:
         """Has the time in a parameter passed? Zero or less means never."""
         wait_s = float(self._parameters.get(parameter))
         return wait_s > 0.0 and waited_us >= wait_s * 1e6
+
+
+def land_limits(parameters: ParameterTable) -> LandLimits:
+    """Return the land detector's thresholds from MPC_* and LNDMC_*."""
+    get = parameters.get
+    return LandLimits(
+        thr_min=float(get("MPC_THR_MIN")),
+        hover_thrust=float(get("MPC_THR_HOVER")),
+        manual_min=float(get("MPC_MANTHR_MIN")),
+        z_vel_max=float(get("LNDMC_Z_VEL_MAX")),
+        xy_vel_max=float(get("LNDMC_XY_VEL_MAX")),
+        rot_max=math.radians(float(get("LNDMC_ROT_MAX"))),
+    )

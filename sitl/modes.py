@@ -15,6 +15,8 @@ class Mode(IntEnum):
     MISSION = 3
     LOITER = 4
     RTL = 5
+    POSITION_SLOW = 6
+    ALTITUDE_CRUISE = 8
     ACRO = 10
     DESCEND = 12
     TERMINATION = 13
@@ -22,7 +24,22 @@ class Mode(IntEnum):
     STABILIZED = 15
     TAKEOFF = 17
     LAND = 18
+    FOLLOW_TARGET = 19
+    PRECLAND = 20
+    ORBIT = 21
+    VTOL_TAKEOFF = 22
+    EXTERNAL1 = 23
+    EXTERNAL2 = 24
+    EXTERNAL3 = 25
+    EXTERNAL4 = 26
+    EXTERNAL5 = 27
+    EXTERNAL6 = 28
+    EXTERNAL7 = 29
+    EXTERNAL8 = 30
 
+
+EXTERNAL_MODES = tuple(Mode(number) for number in range(Mode.EXTERNAL1, Mode.EXTERNAL8 + 1))
+"""Modes that a companion computer would bring; this vehicle has none."""
 
 MODE_NAMES = {
     Mode.MANUAL: "Manual",
@@ -31,6 +48,8 @@ MODE_NAMES = {
     Mode.MISSION: "Mission",
     Mode.LOITER: "Hold",
     Mode.RTL: "Return",
+    Mode.POSITION_SLOW: "Position Slow",
+    Mode.ALTITUDE_CRUISE: "Altitude Cruise",
     Mode.ACRO: "Acro",
     Mode.DESCEND: "Descend",
     Mode.TERMINATION: "Termination",
@@ -38,15 +57,51 @@ MODE_NAMES = {
     Mode.STABILIZED: "Stabilized",
     Mode.TAKEOFF: "Takeoff",
     Mode.LAND: "Land",
+    Mode.FOLLOW_TARGET: "Follow Target",
+    Mode.PRECLAND: "Precision Landing",
+    Mode.ORBIT: "Orbit",
+    Mode.VTOL_TAKEOFF: "VTOL Takeoff",
+    **{mode: f"External {number}" for number, mode in enumerate(EXTERNAL_MODES, start=1)},
 }
 
-AVAILABLE = (Mode.LOITER, Mode.TAKEOFF, Mode.LAND, Mode.OFFBOARD)
-"""Modes a caller may choose on this vehicle."""
+FLOWN_AS = {
+    Mode.POSITION_SLOW: Mode.POSCTL,
+    Mode.ALTITUDE_CRUISE: Mode.ALTCTL,
+    Mode.FOLLOW_TARGET: Mode.LOITER,
+    Mode.PRECLAND: Mode.LAND,
+    Mode.VTOL_TAKEOFF: Mode.TAKEOFF,
+    Mode.ORBIT: Mode.LOITER,
+}
+"""Modes that fly another's law: without a target to follow or to land on PX4 holds or lands here as well, and an orbit
+is a place that Hold goes round."""
 
-POSITION_MODES = frozenset({Mode.LOITER, Mode.TAKEOFF, Mode.LAND, Mode.DESCEND})
-"""Modes that the position controller flies."""
+STICK_MODES = frozenset(
+    {
+        Mode.MANUAL,
+        Mode.STABILIZED,
+        Mode.ACRO,
+        Mode.ALTCTL,
+        Mode.ALTITUDE_CRUISE,
+        Mode.POSCTL,
+        Mode.POSITION_SLOW,
+    }
+)
+"""Modes that a pilot's sticks fly."""
 
-NEVER_ARM = frozenset({Mode.RTL, Mode.LAND, Mode.DESCEND, Mode.TERMINATION})
+CLIMB_MODES = STICK_MODES - {Mode.MANUAL, Mode.STABILIZED, Mode.ACRO}
+"""Those of them in which the throttle stick asks for a climb rate."""
+
+NEVER_ARM = frozenset(
+    {
+        Mode.RTL,
+        Mode.LAND,
+        Mode.DESCEND,
+        Mode.TERMINATION,
+        Mode.FOLLOW_TARGET,
+        Mode.PRECLAND,
+        Mode.ORBIT,
+    }
+)
 """Modes in which PX4 refuses to arm."""
 
 
@@ -58,6 +113,8 @@ class Result(IntEnum):
     DENIED = 2
     UNSUPPORTED = 3
     FAILED = 4
+    IN_PROGRESS = 5
+    CANCELLED = 6
 
 
 class LandedState(IntEnum):

@@ -29,13 +29,22 @@ ParameterType = Literal["INT32", "REAL32"]
 NAME_LENGTH: Final = 16
 """Longest name MAVLink can carry, in characters."""
 
-_FILE: Final = Path(__file__).with_name("parameters.toml")
+KEPT: Final = "Kept; no effect here. "
+"""How the description of a parameter begins that this vehicle stores but does not act on."""
+
+_FILES: Final = {
+    Path(__file__).with_name("parameters.toml"): True,
+    Path(__file__).with_name("parameters_kept.toml"): False,
+    Path(__file__).with_name("parameters_estimator.toml"): False,
+}
+"""Where the parameters are listed, and whether the vehicle acts on those of the file."""
+
 _INT32: Final = struct.Struct("<i")
 _REAL32: Final = struct.Struct("<f")
 _NAME: Final = re.compile(r"[A-Z][A-Z0-9_]*\Z")
 _SERIES: Final = re.compile(r"\{(\d+)\.\.(\d+)\}")
 _KEYS: Final = frozenset(
-    {"default", "min", "max", "unit", "decimals", "increment"} | {"reboot", "volatile", "short", "values", "obeyed"}
+    {"default", "min", "max", "unit", "decimals", "increment", "reboot", "volatile", "short", "values"}
 )
 
 
@@ -140,13 +149,30 @@ def range_problem(spec: ParameterSpec, value: int | float) -> str | None:
     return None
 
 
+@functools.cache
 def parameter_specs() -> Mapping[str, ParameterSpec]:
-    """Every parameter of this vehicle by name, sorted by name; read once from `parameters.toml`."""
-    return _load(_FILE)
+    """Every parameter of this vehicle by name, sorted by name; read once from `parameters*.toml`."""
+    specs: dict[str, ParameterSpec] = {}
+    for path, obeyed in _FILES.items():
+        for name, spec in _load(path, obeyed=obeyed).items():
+            if name in specs:
+                raise FileError(path, f"{name} is listed in another file, too", "Remove one of the two")
+            specs[name] = spec
+    return dict(sorted(specs.items()))
 
 
 @functools.cache
-def _load(path: Path) -> Mapping[str, ParameterSpec]:
+def _factory() -> tuple[Mapping[str, int | float], Mapping[str, bytes], tuple[tuple[bytes, str], ...]]:
+    """What every table begins with: values, their bytes, and the names that are hashed, encoded and plain."""
+    specs = parameter_specs()
+    return (
+        {name: spec.default for name, spec in specs.items()},
+        {name: to_raw(name, spec.type, spec.default) for name, spec in specs.items()},
+        tuple((name.encode(), name) for name, spec in specs.items() if not spec.volatile),
+    )
+
+
+def _load(path: Path, *, obeyed: bool = True) -> Mapping[str, ParameterSpec]:
     try:
         with path.open("rb") as file:
             groups = tomllib.load(file)
@@ -160,8 +186,8 @@ def _load(path: Path) -> Mapping[str, ParameterSpec]:
             for name, number in _expand(pattern):
                 if name in specs:
                     raise FileError(path, f"{name} is listed twice", "Remove one of the two")
-                specs[name] = _spec(path, name, group, entry, number)
-    return dict(sorted(specs.items()))
+                specs[name] = _spec(path, name, group, entry, number, obeyed=obeyed)
+    return specs
 
 
 def _expand(pattern: str) -> Iterator[tuple[str, int | None]]:
@@ -174,7 +200,9 @@ def _expand(pattern: str) -> Iterator[tuple[str, int | None]]:
         yield f"{pattern[: series.start()]}{number}{pattern[series.end() :]}", number
 
 
-def _spec(path: Path, name: str, group: str, entry: Mapping[str, Any], number: int | None) -> ParameterSpec:
+def _spec(
+    path: Path, name: str, group: str, entry: Mapping[str, Any], number: int | None, *, obeyed: bool
+) -> ParameterSpec:
     """One entry of the file, checked."""
     if not _NAME.match(name) or len(name) > NAME_LENGTH:
         raise FileError(path, f"{name} is no parameter name", f"Use 1 to {NAME_LENGTH} of A-Z, 0-9 and _")
@@ -206,9 +234,9 @@ def _spec(path: Path, name: str, group: str, entry: Mapping[str, Any], number: i
         increment=entry.get("increment"),
         reboot=entry.get("reboot", False),
         group=group,
-        short=short,
+        short=short if obeyed else KEPT + short,
         values={int(value): text for value, text in entry.get("values", {}).items()},
-        obeyed=entry.get("obeyed", True),
+        obeyed=obeyed,
         volatile=entry.get("volatile", False),
     )
     problem = range_problem(spec, spec.default)
@@ -232,8 +260,9 @@ class ParameterTable:
         self._specs = parameter_specs()
         self.names: tuple[str, ...] = tuple(self._specs)
         self._index = {name: index for index, name in enumerate(self.names)}
-        self._values = {name: spec.default for name, spec in self._specs.items()}
-        self._raws = {name: to_raw(name, spec.type, spec.default) for name, spec in self._specs.items()}
+        values, raws, self._hashed = _factory()
+        self._values = dict(values)
+        self._raws = dict(raws)
         for name, value in (overrides or {}).items():
             type_ = self.spec(name).type
             self._raws[name] = raw = to_raw(name, type_, value)
@@ -242,6 +271,7 @@ class ParameterTable:
         self._stamps: dict[str, int] = {}
         self.revision = 0
         """Number of sets so far: an unchanged number means unchanged values."""
+        self._hash = (-1, 0)  # revision it belongs to, and the hash
 
     def __len__(self) -> int:
         return len(self.names)
@@ -329,7 +359,11 @@ class ParameterTable:
     def hash_check(self) -> int:
         """PX4's `_HASH_CHECK`: CRC-32 (start 0, no final inversion) over name and value bytes in index order.
 
-        Volatile parameters are left out. PX4: param_hash_check, crc32part.
+        Volatile parameters are left out. Nothing is calculated again as long as nothing is set.
+        PX4: param_hash_check, crc32part.
         """
-        parts = (name.encode() + self._raws[name] for name, spec in self._specs.items() if not spec.volatile)
-        return zlib.crc32(b"".join(parts), 0xFFFFFFFF) ^ 0xFFFFFFFF
+        if self._hash[0] != self.revision:
+            raws = self._raws
+            data = b"".join([part for encoded, name in self._hashed for part in (encoded, raws[name])])
+            self._hash = (self.revision, zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF)
+        return self._hash[1]

@@ -38,9 +38,19 @@ POSITION_SETTINGS = np.dtype(
 """MPC_* parameters in SI; tilt_max in rad."""
 
 POSITION_INPUT = np.dtype(
-    [("position_sp", "f8", (3,)), ("velocity_sp", "f8", (3,)), ("yaw_sp", "f8"), ("idle", "?")], align=True
+    [
+        ("position_sp", "f8", (3,)),
+        ("velocity_sp", "f8", (3,)),
+        ("acceleration_sp", "f8", (3,)),
+        ("yaw_sp", "f8"),
+        ("idle", "?"),
+    ],
+    align=True,
 )
-"""NED set-points, m and m/s (NaN position: that axis follows velocity_sp alone); idle: on the ground, no thrust."""
+"""NED set-points, m, m/s and m/s^2; idle: on the ground, no thrust.
+
+What is NaN is left out: an axis without a position follows its velocity, one without both its acceleration alone.
+"""
 
 POSITION_STATE = np.dtype(
     [
@@ -149,6 +159,11 @@ def position_tick(
     for i in range(3):
         error[i] = state.vel_sp[i] - velocity[i]
         state.acc_sp[i] = s.vel_p[i] * error[i] + state.vel_int[i] - s.vel_d[i] * state.vel_dot[i]
+        extra = request.acceleration_sp[i]
+        if math.isfinite(extra):
+            state.acc_sp[i] = state.acc_sp[i] + extra if math.isfinite(error[i]) else extra
+        elif not math.isfinite(error[i]):
+            state.acc_sp[i] = 0.0
     if request.idle:
         for i in range(3):
             state.vel_int[i] = 0.0

@@ -53,6 +53,15 @@ def geodetic(
     return lat, lon, origin[2] - position_ned[2]
 
 
+def local_position(
+    lat_deg: float, lon_deg: float, alt_m: float, origin: tuple[float, float, float] = ORIGIN
+) -> tuple[float, float, float]:
+    """NED position (m) of a latitude (deg), longitude (deg) and height (m AMSL); the inverse of `geodetic`."""
+    north = (lat_deg - origin[0]) * _METRES_PER_DEG
+    east = (lon_deg - origin[1]) * _metres_per_deg_east(origin[0])
+    return north, east, origin[2] - alt_m
+
+
 @cache
 def _metres_per_deg_east(lat_deg: float) -> float:
     return _METRES_PER_DEG * math.cos(math.radians(lat_deg))

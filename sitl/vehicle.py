@@ -197,6 +197,9 @@ def airframe_parameters(model: VehicleModel, profile: Profile) -> dict[str, floa
         "IMU_GYRO_CUTOFF": profile.gyro_cutoff_hz,
         "IMU_DGYRO_CUTOFF": profile.dgyro_cutoff_hz,
         "MC_YAW_TQ_CUTOFF": 0.0 if profile.linear else 2.0,
+        # what PX4's start-up script for simulators sets: log from boot, keep a few days of logs
+        "SDLOG_MODE": 1,
+        "SDLOG_DIRS_MAX": 7,
     }
     for i, rotor in enumerate(rotors):
         for what, value in (("PX", rotor.px_m), ("PY", rotor.py_m), ("PZ", rotor.pz_m), ("KM", rotor.km)):

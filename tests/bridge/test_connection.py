@@ -7,6 +7,7 @@ from pymavlink.dialects.v10 import common as v1
 from pymavlink.dialects.v20 import common as v2
 
 from bridge.connection import Connection
+from bridge.signing import Signer, SigningKey
 from sitl.errors import UsageError
 
 PARAM = {"param_id": "MC_ROLL_P", "param_value": 6.5, "param_type": 9, "param_count": 300, "param_index": 120}
@@ -114,6 +115,47 @@ def test_both_directions_reach_the_log() -> None:
     heard = other.encode("ATTITUDE")
     ours.receive(b"noise" + heard)
     assert log == [sent, heard]
+
+
+KEY = SigningKey(bytes(range(32)), 1000)
+
+
+def test_a_signer_may_come_and_go_between_two_messages() -> None:
+    ours, other = Connection(1, 1, datagram=True), Connection(255, 190, datagram=True)
+    seen = []
+    for signer in (None, Signer(KEY, 0), None):
+        ours.signer = signer
+        assert ours.signer is signer
+        (message,) = other.receive(ours.encode("HEARTBEAT"))
+        seen.append((message.seq, message.signed, len(message.raw_frame)))
+        assert len(ours.receive(Connection(255, 190).encode("HEARTBEAT"))) == (signer is None)
+    (first, _, plain), *_ = seen
+    assert seen == [(first, False, plain), (first + 1, True, plain + 13), (first + 2, False, plain)]
+    assert ours.counters.unsigned_refused == 1
+
+
+def test_refused_frames_tell_nothing_of_the_packet_counter() -> None:
+    ours = Connection(1, 1, datagram=True, signer=Signer(KEY, 0))
+    theirs, forger = Connection(7, 8, signer=Signer(KEY, 1)), Connection(7, 8)
+    forger.sent = 100
+    for _ in range(10):
+        assert len(ours.receive(theirs.encode("HEARTBEAT"))) == 1
+        assert ours.receive(forger.encode("HEARTBEAT")) == []
+    assert (ours.counters.lost, ours.counters.late) == (0, 0)
+    assert not ours.counters.knows(9, 9)
+
+
+def test_the_log_holds_neither_signatures_nor_keys() -> None:
+    """As MAVLink's page on message signing asks: a log must not help anybody to sign."""
+    ours, other = Connection(1, 1, signer=Signer(KEY, 0)), Connection(255, 190, signer=Signer(KEY, 1))
+    log: list[bytes] = []
+    ours.on_frame = log.append
+    ours.encode("ATTITUDE", roll=0.5)
+    ours.receive(other.encode("HEARTBEAT", type=6))
+    ours.receive(other.encode("SETUP_SIGNING", secret_key=KEY.secret))
+    ours.receive(Connection(9, 9).encode("HEARTBEAT"))
+    plain = Connection(1, 1).encode("ATTITUDE", roll=0.5), Connection(255, 190).encode("HEARTBEAT", type=6)
+    assert log == list(plain)
 
 
 def test_an_unknown_message_is_refused_with_the_nearest_name() -> None:

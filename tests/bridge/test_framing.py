@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from bridge.connection import Connection
 from bridge.framing import BUFFER_LIMIT, crc16
+from bridge.signing import Signer, SigningKey
 
 KINDS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("HEARTBEAT", {"type": 2, "autopilot": 12}),
@@ -236,3 +237,60 @@ def test_noise_that_looks_like_an_unknown_message_is_noise() -> None:
     connection = Connection(255, 190, datagram=True)
     connection.receive(noise)
     assert (connection.counters.unknown, connection.counters.bad_bytes) == (0, len(noise))
+
+
+KEY, OTHER = SigningKey(bytes(range(32)), 1000), SigningKey(bytes(range(1, 33)), 1000)
+
+
+def signed_frames(count: int, key: SigningKey = KEY) -> list[bytes]:
+    sender = Connection(1, 1, signer=Signer(key, 0))
+    return [sender.encode(name, **fields) for name, fields in (KINDS[index % len(KINDS)] for index in range(count))]
+
+
+def guarded(*, datagram: bool = False) -> Connection:
+    return Connection(255, 190, datagram=datagram, signer=Signer(KEY, 1))
+
+
+@given(cuts=st.lists(st.integers(0, 100_000), max_size=40), garbage=st.lists(beginnings, min_size=6, max_size=6))
+def test_signed_frames_between_garbage_are_found(cuts: list[int], garbage: list[bytes]) -> None:
+    good = signed_frames(6)
+    stream = b"".join(noise + frame for noise, frame in zip(garbage, good, strict=True))
+    connection = guarded()
+    found = []
+    for begin, end in pairwise([0, *sorted(cut % (len(stream) + 1) for cut in cuts), len(stream)]):
+        found += connection.receive(stream[begin:end])
+        assert connection.pending <= BUFFER_LIMIT
+    found += connection.flush()
+    assert [m.raw_frame for m in found] == good
+    assert connection.counters.refused == 0
+
+
+@pytest.mark.parametrize("datagram", [True, False])
+def test_a_forged_frame_costs_itself_and_is_no_damage(datagram: bool) -> None:
+    connection = guarded(datagram=datagram)
+    good, forged = signed_frames(6), signed_frames(6, OTHER)
+    stream = b"".join(bad + frame for bad, frame in zip(forged, good, strict=True))
+    assert [m.raw_frame for m in connection.receive(stream)] == good
+    counters = connection.counters
+    assert (counters.received, counters.bad_signature, counters.lost) == (6, 6, 0)
+    assert (counters.bad_bytes, counters.resyncs, counters.bad_crc) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("missing", range(1, 14))
+def test_a_byte_lost_from_a_signature_does_not_cost_the_next_frame(missing: int) -> None:
+    good = signed_frames(3)
+    short = good[0][:-missing] + good[0][len(good[0]) - missing + 1 :]
+    connection = guarded()
+    assert [m.raw_frame for m in connection.receive(short + good[1] + good[2])] == good[1:]
+    assert connection.counters.bad_signature == 1
+
+
+def test_a_refused_frame_does_not_bring_in_what_it_carries() -> None:
+    inner = b"".join(frames(3))
+    for outer in (Connection(1, 1), Connection(1, 1, signer=Signer(OTHER, 0))):
+        for datagram in (True, False):
+            connection = Connection(255, 190, datagram=datagram, signer=Signer(KEY, 1))
+            frame = outer.encode("FILE_TRANSFER_PROTOCOL", payload=inner)
+            assert [m for part in (frame[:50], frame[50:]) for m in connection.receive(part)] == [] or datagram
+            assert connection.receive(frame) == []
+            assert connection.counters.received == 0

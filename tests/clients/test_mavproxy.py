@@ -1,139 +1,83 @@
-"""MAVProxy without a terminal: commands through its standard input, answers from its output."""
+"""MAVProxy: parameters, a flight, missions, logs, files."""
 
 from __future__ import annotations
 
-import os
-import re
-import shutil
-import subprocess
-import sys
-import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO
 
 import pytest
+from mavproxy_console import MODULES, Console
+from vehicle_process import VehicleProcess
 
 from sitl.parameters import parameter_specs
 
 pytestmark = pytest.mark.client
 
-MODULES = "param,mode,arm,misc,link,output,cmdlong,ftp"
+
+@pytest.fixture(scope="module")
+def vehicle(sitl: Callable[..., VehicleProcess], tmp_path_factory: pytest.TempPathFactory) -> VehicleProcess:
+    return sitl("--log-dir", str(tmp_path_factory.mktemp("logs")), speed=3.0, mode="gcs")
 
 
-class Console:
-    """A running MAVProxy."""
-
-    def __init__(self, port: int, directory: Path) -> None:
-        program = Path(sys.executable).with_name("mavproxy.py")
-        if not program.exists():
-            pytest.skip("MAVProxy is not installed")
-        self._process = subprocess.Popen(
-            [
-                sys.executable,
-                "-W",
-                "ignore",
-                str(program),
-                f"--master=udpin:127.0.0.1:{port}",
-                "--mav20",
-                "--streamrate=-1",
-                f"--state-basedir={directory}",
-                f"--default-modules={MODULES}",
-            ],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            cwd=directory,
-            env={**os.environ, "PYTHONUNBUFFERED": "1", "TERM": "dumb", "HOME": str(directory)},
-        )
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._stdin, self._stdout = self._process.stdin, self._process.stdout
-        self._text = ""
-        self._read_to = 0
-        self._changed = threading.Condition()
-        threading.Thread(target=self._read, args=(self._stdout,), daemon=True).start()
-
-    def _read(self, stream: IO[bytes]) -> None:
-        # The prompt ends without a newline, so lines cannot be waited for.
-        while data := os.read(stream.fileno(), 4096):
-            with self._changed:
-                self._text += data.decode(errors="replace")
-                self._changed.notify_all()
-
-    def say(self, line: str) -> None:
-        """Type a line; what was printed before it no longer counts."""
-        with self._changed:
-            self._read_to = len(self._text)
-        self._stdin.write(line.encode() + b"\n")
-        self._stdin.flush()
-
-    def until(self, pattern: str, limit_s: float = 20.0) -> re.Match[str]:
-        """Wait until something is printed that matches."""
-        end = time.monotonic() + limit_s
-        with self._changed:
-            while True:
-                found = re.compile(pattern).search(self._text, self._read_to)
-                if found:
-                    self._read_to = found.end()
-                    return found
-                if not self._changed.wait(max(0.0, end - time.monotonic())):
-                    raise AssertionError(f"no {pattern!r} within {limit_s} s in:\n{self._text[self._read_to :]}")
-
-    def close(self) -> None:
-        """End it; a MAVProxy on a pipe does not listen to SIGTERM."""
-        self._process.kill()
-        self._process.wait(timeout=10)
-        self._stdin.close()
-        self._stdout.close()
+@pytest.fixture(scope="module")
+def mavproxy(vehicle: VehicleProcess, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Console]:
+    """One MAVProxy for the tests of this file: it takes seconds to start."""
+    with Console(vehicle.port, tmp_path_factory.mktemp("mavproxy")) as console:
+        assert console.parameters() == len(parameter_specs())
+        yield console
 
 
-@pytest.fixture
-def console(serve: Callable[..., int], tmp_path: Path) -> Iterator[Callable[..., Console]]:
-    opened: list[Console] = []
-
-    def start(speed: float = 1.0) -> Console:
-        directory = tmp_path / "mavproxy"
-        shutil.rmtree(directory, ignore_errors=True)
-        directory.mkdir()
-        opened.append(Console(serve(speed=speed), directory))
-        return opened[-1]
-
-    yield start
-    for one in opened:
-        one.close()
-
-
-def test_parameters(console: Callable[..., Console]) -> None:
-    mavproxy = console()
-    received = mavproxy.until(r"Received (\d+) parameters", limit_s=60.0)
-    assert int(received[1]) == len(parameter_specs())
+def test_parameters(mavproxy: Console) -> None:
+    specs = parameter_specs()
     mavproxy.say("param show MC_ROLL_P")
-    mavproxy.until(rf"MC_ROLL_P\s+{parameter_specs()['MC_ROLL_P'].default}")
+    mavproxy.until(rf"MC_ROLL_P\s+{specs['MC_ROLL_P'].default}")
     mavproxy.say("param set MC_ROLL_P 7.25")
-    assert fetched(mavproxy, "MC_ROLL_P", "7.25")
+    assert mavproxy.fetched("MC_ROLL_P", "7.25")
     mavproxy.say("param set COM_OBL_RC_ACT 5")
-    assert fetched(mavproxy, "COM_OBL_RC_ACT", "5")
+    assert mavproxy.fetched("COM_OBL_RC_ACT", "5")
 
 
-def fetched(mavproxy: Console, name: str, value: str) -> bool:
-    """Ask the vehicle for a parameter until it has the value: MAVProxy sets it in its own time."""
-    for _ in range(20):
-        mavproxy.say(f"param fetch {name}")
-        if mavproxy.until(rf"{name} = (\S+)")[1].startswith(value):
-            return True
-        time.sleep(0.2)
-    return False
+def test_a_parameter_file(mavproxy: Console) -> None:
+    (mavproxy.folder / "gains.parm").write_text("MC_ROLLRATE_P 0.125\nMC_PITCHRATE_P 0.25\nMC_YAW_P 3.5\n")
+    mavproxy.say("param load gains.parm")
+    mavproxy.until(r"Loaded 3 parameters from gains.parm")
+    assert mavproxy.fetched("MC_PITCHRATE_P", "0.25")
+    mavproxy.say("param save saved.parm")
+    mavproxy.until(r"Saved \d+ parameters to saved.parm")
+    saved = dict(line.split() for line in (mavproxy.folder / "saved.parm").read_text().splitlines() if line[0] != "#")
+    assert float(saved["MC_ROLLRATE_P"]) == 0.125
+    for name in ("MC_ROLLRATE_P", "MC_PITCHRATE_P", "MC_YAW_P", "MC_ROLL_P"):
+        default = f"{parameter_specs()[name].default:g}"
+        mavproxy.say(f"param set {name} {default}")
+        assert mavproxy.fetched(name, default)
 
 
-def test_a_flight(console: Callable[..., Console]) -> None:
-    mavproxy = console(speed=2.0)
-    mavproxy.until(r"Received \d+ parameters", limit_s=60.0)
+def test_a_mission(mavproxy: Console) -> None:
+    lines = ["QGC WPL 110"]
+    for seq, (command, north) in enumerate([(22, 0.0), (16, 1e-4), (21, 0.0)]):
+        place = f"{47.397742 + north:.7f}\t8.5455940\t{6 if command != 21 else 0:.6f}"
+        lines.append(f"{seq}\t{int(seq == 0)}\t3\t{command}\t0\t0\t0\t0\t{place}\t1")
+    (mavproxy.folder / "plan.waypoints").write_text("\n".join(lines) + "\n")
+    mavproxy.say("wp load plan.waypoints")
+    mavproxy.until(r"Loaded 3 waypoints from plan.waypoints")
+    mavproxy.until(r"Loaded 3 waypoints in")
+    mavproxy.say("wp list")
+    mavproxy.until(r"Requesting 3 waypoints")
+    for command in (22, 16, 21):
+        mavproxy.until(rf"\n{command} 3 47\.397")
+    mavproxy.say("wp clear")
+    mavproxy.say("wp list")
+    mavproxy.until(r"Requesting 0 waypoints")
+
+
+def test_a_flight(mavproxy: Console) -> None:
     mavproxy.say("long DO_SET_MODE 209 4 3 0 0 0 0")
     mavproxy.until(r"Got COMMAND_ACK: DO_SET_MODE: ACCEPTED")
-    mavproxy.say("long DO_SET_MODE 209 1 0 0 0 0 0")
-    mavproxy.until(r"Got COMMAND_ACK: DO_SET_MODE: TEMPORARILY_REJECTED")
+    # No sticks, so nobody could fly in it.
+    mavproxy.say("long DO_SET_MODE 209 3 0 0 0 0 0")
+    mavproxy.until(r"Got COMMAND_ACK: DO_SET_MODE: (ACCEPTED|TEMPORARILY_REJECTED)")
+    mavproxy.say("long DO_SET_MODE 209 4 3 0 0 0 0")
+    mavproxy.until(r"Got COMMAND_ACK: DO_SET_MODE: ACCEPTED")
     mavproxy.say("arm throttle")
     mavproxy.until(r"Got COMMAND_ACK: COMPONENT_ARM_DISARM: ACCEPTED")
     mavproxy.until(r"ARMED")
@@ -142,6 +86,44 @@ def test_a_flight(console: Callable[..., Console]) -> None:
     mavproxy.until(r"LOITER", limit_s=30.0)
     mavproxy.say("disarm")
     mavproxy.until(r"Disarming denied: not landed")
+    mavproxy.say("long DO_SET_MODE 209 4 5 0 0 0 0")
+    mavproxy.until(r"Got COMMAND_ACK: DO_SET_MODE: ACCEPTED")
+    mavproxy.until(r"RTL")
     mavproxy.say("long NAV_LAND 0 0 0 nan nan nan nan")
     mavproxy.until(r"Got COMMAND_ACK: NAV_LAND: ACCEPTED")
     mavproxy.until(r"DISARMED", limit_s=40.0)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_the_log_of_that_flight(mavproxy: Console) -> None:
+    pyulog = pytest.importorskip("pyulog")
+    mavproxy.say("log list")
+    entry = mavproxy.until(r"Log (\d+)  numLogs 1 lastLog \d+ size (\d+) \S+")
+    mavproxy.say(f"log download {entry[1]} flight.ulg")
+    mavproxy.until(r"Finished downloading flight.ulg", limit_s=60.0)
+    path = mavproxy.folder / "flight.ulg"
+    assert path.stat().st_size == int(entry[2])
+    log = pyulog.ULog(str(path))
+    assert not log.file_corruption
+    assert -log.get_dataset("vehicle_local_position").data["z"].min() > 3.0
+
+
+def test_parameters_and_files_by_ftp(
+    vehicle: VehicleProcess, sitl: Callable[..., VehicleProcess], tmp_path: Path
+) -> None:
+    # A vehicle of its own: the other MAVProxy holds the port of the first.
+    own = sitl(mode="gcs")
+    with Console(own.port, tmp_path, modules=f"{MODULES},ftp") as mavproxy:
+        received = mavproxy.until(r"Received (\d+) parameters \(ftp\)", limit_s=60.0)
+        assert int(received[1]) == len(parameter_specs())
+        mavproxy.say("param show MC_ROLL_P")
+        mavproxy.until(rf"MC_ROLL_P\s+{parameter_specs()['MC_ROLL_P'].default}")
+        mavproxy.say("param ftp")
+        mavproxy.until(rf"Received {received[1]} parameters \(ftp\)")
+        mavproxy.say("ftp list /etc/extras")
+        name, size = mavproxy.until(r"\s+(component_general\S+)\t(\d+)").groups()
+        mavproxy.say(f"ftp get /etc/extras/{name} {name}")
+        mavproxy.until(rf"Wrote {size} bytes to {name}")
+        mavproxy.say(f"ftp crc /etc/extras/{name}")
+        mavproxy.until(r"crc: ")
+    own.stop()

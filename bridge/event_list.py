@@ -1,0 +1,121 @@
+"""The events this vehicle can report: what each says, its number, and the JSON that tells ground stations.
+
+PX4 says important things twice: as a text that ends with a TAB, and as an event (MAVLink events service), which a
+ground station translates with the vehicle's own list. Here the text comes first: a template finds the event that
+says the same and the numbers in it.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+from dataclasses import dataclass
+from functools import cache
+
+from sitl.modes import MODE_NAMES
+
+_COMPONENT = 1
+_FNV_START, _FNV_PRIME = 0x811C9DC5, 0x01000193
+_ARGUMENT_BYTES = 40
+_HOLE = re.compile(r"\{(\d)\}")
+_NUMBER = r"([-+]?[\d.]+|[-+]?nan|[-+]?inf)"
+
+_SAID: dict[str, str] = {
+    "armed": "Armed by external command",
+    "disarmed": "Disarmed by external command",
+    "disarmed_landing": "Disarmed by landing",
+    "disarmed_preflight": "Disarmed by auto preflight disarming",
+    "disarmed_failsafe": "Disarmed by failsafe",
+    "takeoff_detected": "Takeoff detected",
+    "landing_detected": "Landing detected",
+    "landing_here": "Landing at current position",
+    "landing_precisely": "Precision landing",
+    "returning": "Returning to launch",
+    "takeoff_default": "Using default takeoff altitude: {1} m",
+    "arming_denied_health": "Arming denied: Resolve system health failures first",
+    "arming_denied_throttle": "Arming denied: throttle not in safe position",
+    "arming_denied_center": "Arming denied: throttle above center",
+    "disarming_denied": "Disarming denied: not landed",
+    "arm_param": "Unsupported ARM_DISARM param: {1}",
+    "main_mode": "Unsupported main mode",
+    "auto_mode": "Unsupported auto mode",
+    "base_mode": "Unsupported base mode",
+    "failsafe": "Failsafe activated",
+    "failsafe_hold": "Failsafe activated: entering Hold for {1} seconds",
+    "gcs_lost": "Connection to ground station lost",
+    "gcs_regained": "GCS connection regained",
+    "sticks": "Pilot took over using sticks",
+    "tilt": "Attitude failure detected",
+    "rtl_height": "RTL: start return at {1} m ({2} m above destination)",
+    "rtl_land": "RTL: land at destination",
+    "mission_none": "Mission start denied! No valid mission",
+    "mission_denied": "Mission start denied",
+    "high_latency": "Control high latency failed! Telemetry unavailable",
+    **{
+        f"mode_{mode.name.lower()}": f"Switching to {name} is currently not available"
+        for mode, name in MODE_NAMES.items()
+    },
+}
+
+
+@dataclass(frozen=True)
+class Event:
+    """One thing the vehicle can say.
+
+    Attributes:
+        name: PX4's way of naming events. message: with {1}, {2} where its numbers go. number: its EVENT.id.
+    """
+
+    name: str
+    message: str
+    number: int
+
+    @property
+    def holes(self) -> int:
+        """How many numbers it carries."""
+        return len(_HOLE.findall(self.message))
+
+
+def find_event(text: str) -> tuple[Event, bytes] | None:
+    """Return the event that says the same as a text, and its arguments (float32, little-endian), or None."""
+    for event, pattern in _events():
+        found = pattern.fullmatch(text)
+        if found:
+            return event, b"".join(struct.pack("<f", float(part)) for part in found.groups())[:_ARGUMENT_BYTES]
+    return None
+
+
+def events_json() -> bytes:
+    """Return the list as ground stations fetch it (component metadata type 4)."""
+    events = {
+        str(event.number & 0xFFFFFF): {
+            "name": event.name,
+            "message": event.message,
+            "arguments": [{"type": "float", "name": f"value{k + 1}"} for k in range(event.holes)],
+        }
+        for event, _ in _events()
+    }
+    tree = {
+        "version": 1,
+        "components": {str(_COMPONENT): {"namespace": "px4", "event_groups": {"default": {"events": events}}}},
+    }
+    return json.dumps(tree, sort_keys=True, separators=(",", ":")).encode()
+
+
+@cache
+def _events() -> tuple[tuple[Event, re.Pattern[str]], ...]:
+    found = []
+    for key, message in _SAID.items():
+        name = f"froude_{key}"
+        pattern = _NUMBER.join(re.escape(part) for part in _HOLE.split(message)[::2])
+        found.append((Event(name, message, _COMPONENT << 24 | _hash(name) & 0xFFFFFF), re.compile(pattern)))
+    return tuple(found)
+
+
+def _hash(name: str) -> int:
+    """FNV-1a, as PX4 numbers its events."""
+    value = _FNV_START
+    for byte in name.encode():
+        value = (value ^ byte) * _FNV_PRIME & 0xFFFFFFFF
+    return value
