@@ -88,11 +88,12 @@ class Commands:
         self._server = server
         self._flight = FlightCommands(server)
         self.ground = GroundCommands(server)
+        self._messages = MessageCommands(server).actions()
         self._actions: dict[int, Action] = {
             **dict.fromkeys(_SILENT, _stay_silent),
             **self._flight.actions(),
             **self.ground.actions(),
-            **MessageCommands(server).actions(),
+            **self._messages,
         }
 
     def handle(self, link: ServerLink, msg: Any) -> None:
@@ -113,7 +114,8 @@ class Commands:
         action = self._actions.get(number)
         result = Result.UNSUPPORTED if action is None else action(command)
         if result is not None:
-            server.acknowledge(number, result, msg.sysid, msg.compid)
+            # what asks for messages is answered where it is read, the rest by the commander in its turn
+            server.acknowledge(number, result, msg.sysid, msg.compid, now=number in self._messages)
 
     def handle_set_mode(self, link: ServerLink, msg: Any) -> None:
         """Carry out a SET_MODE message as the DO_SET_MODE it became."""

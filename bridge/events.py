@@ -100,7 +100,7 @@ class EventServer:
         replies: list[Reply] = []
         if link_id not in self._links:
             self._links.add(link_id)
-            self._seen[link_id] = self._next
+            self._seen.setdefault(link_id, _START)
             self._due_us[link_id] = now_us + _SEQUENCE_US
             return [("CURRENT_EVENT_SEQUENCE", {"sequence": self._next - 1 & 0xFFFF, "flags": _RESET})]
         seen = self._seen[link_id]

@@ -121,7 +121,7 @@ class GroundCommands:
         due_us = self._server.vehicle.time_us + _STOP_LOGGING_US
         if len(self._later) < 8:
             answer = (command.number, Result.ACCEPTED, *command.sender)
-            self._later.append((due_us, lambda: self._server.acknowledge(*answer)))
+            self._later.append((due_us, lambda: self._server.acknowledge(*answer, now=True)))
 
     def _high_latency(self, _: Command) -> Result:
         self._server.say(Severity.CRITICAL, "Control high latency failed! Telemetry unavailable\t")

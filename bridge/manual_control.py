@@ -19,7 +19,7 @@ _NO_AXIS = 32767  # INT16_MAX: the joystick has no such axis
 _CHANNELS = 18
 _KEEP = 65535  # UINT16_MAX: this message says nothing of the channel
 _RELEASE = 0
-_STICKS = ("ROLL", "PITCH", "YAW", "THROTTLE")
+_STICKS = ("RC_MAP_ROLL", "RC_MAP_PITCH", "RC_MAP_YAW", "RC_MAP_THROTTLE")
 
 
 class ManualControl:
@@ -71,12 +71,13 @@ class ManualControl:
     def _stick(self, name: str) -> float | None:
         """Return a stick's place -1..1, None if it is not mapped or its channel is silent."""
         get = self._server.vehicle.parameters.get
-        number = int(get(f"RC_MAP_{name}"))
+        number = int(get(name))
         if not 1 <= number <= _CHANNELS or not self._channels[number - 1]:
             return None
-        low, trim, high, sign = (float(get(f"RC{number}_{part}")) for part in ("MIN", "TRIM", "MAX", "REV"))
+        low, high = float(get(f"RC{number}_MIN")), float(get(f"RC{number}_MAX"))
+        trim, sign = float(get(f"RC{number}_TRIM")), float(get(f"RC{number}_REV"))
         width_us = min(high, max(low, float(self._channels[number - 1])))
-        if name == "THROTTLE":
+        if name == "RC_MAP_THROTTLE":
             trim = (low + high) / 2.0
         span = high - trim if width_us > trim else trim - low
         return sign * (width_us - trim) / span if span > 0.0 else 0.0

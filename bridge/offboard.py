@@ -76,7 +76,7 @@ class OffboardSetpoints:
         problem = _problem(quat, rates, thrust, mask)
         if problem:
             server.refusals += 1
-            server.say_at_times(Severity.WARNING, problem, f"SET_ATTITUDE_TARGET ignored: {problem}")
+            server.say_at_times(Severity.WARNING, problem, f"Set-point ignored: {problem}")
             return
         server.vehicle.autopilot.offboard_attitude(quat, rates, thrust)
 

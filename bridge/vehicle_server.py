@@ -73,6 +73,7 @@ class VehicleServer:
         self.refusals = 0
         self.shutdown_asked = False
         self._said_us: dict[str, int] = {}
+        self._acknowledged: list[tuple[int, Result, int, int]] = []
         self._log: FlightLog | None = None
         self.services = Services(
             vehicle,
@@ -86,6 +87,7 @@ class VehicleServer:
         )
         self.source = Source(vehicle, self.sysid, utc_boot_us)
         self.source.metadata = self.services.metadata
+        self.services.events.report(Severity.INFO, "Sensors and estimator are starting", vehicle.time_us)
         self.forwarder = Forwarder(self.links, system_id=self.sysid, component_id=self.compid, lost=self._peer_lost)
         self._log = self.services.log
         self._forwards = len(self.links) > 1
@@ -158,6 +160,8 @@ class VehicleServer:
                         self._housekeeping_us = now_us
                 except (PeerLost, LinkClosed):
                     self._peer_lost(link)
+        while self._acknowledged:
+            self._acknowledge(*self._acknowledged.pop(0))
 
     def close(self) -> None:
         """End what is being written; the links stay open. Raises FileError as `Services.close`."""
@@ -183,19 +187,27 @@ class VehicleServer:
             self._said_us[topic] = now_us
             self.say(severity, text)
 
-    def acknowledge(self, command: int, result: Result, sysid: int, compid: int) -> None:
-        """Send the one COMMAND_ACK of a command, on every link where its sender was heard."""
+    def acknowledge(self, command: int, result: Result, sysid: int, compid: int, *, now: bool = False) -> None:
+        """Send the one COMMAND_ACK of a command, on every link where its sender was heard.
+
+        Args:
+            command: MAV_CMD. result: what became of it. sysid, compid: who sent it.
+            now: before anything else that came with it is read; otherwise after, as when a PX4's commander has
+                taken its turn.
+        """
+        if now:
+            self._acknowledge(command, result, sysid, compid)
+        else:
+            self._acknowledged.append((command, result, sysid, compid))
+
+    def _acknowledge(self, command: int, result: Result, sysid: int, compid: int) -> None:
+        fields = {"command": command, "result": int(result), "target_system": sysid, "target_component": compid}
         for link in self.links:
             if (sysid, compid) in link.peers:
-                link.send(
-                    "COMMAND_ACK",
-                    {
-                        "command": command,
-                        "result": int(result),
-                        "target_system": sysid,
-                        "target_component": compid,
-                    },
-                )
+                try:
+                    link.send("COMMAND_ACK", fields)
+                except (PeerLost, LinkClosed):
+                    self._peer_lost(link)
 
     def is_for_us(self, msg: Any, *, any_component: bool = False) -> bool:
         """Return whether a message's target is this vehicle, or everybody."""

@@ -12,7 +12,8 @@ from sitl.commander import Commander
 from sitl.flight_control import FlightControl
 from sitl.guide import ATTITUDE_BY_STICK
 from sitl.landing_watch import land_limits
-from sitl.modes import Mode
+from sitl.modes import LandedState, Mode
+from sitl.navigator import Navigator
 from sitl.parameters import ParameterTable
 from sitl.plant import Plant
 from sitl.profile import Profile
@@ -56,6 +57,18 @@ class Autopilot(Commander):
     def motor_count(self) -> int:
         """Number of rotors in the parameters."""
         return self.control.motor_count
+
+    @property
+    def navigator(self) -> Navigator:
+        """Where the modes that hold a position want to be."""
+        return self.control.navigator
+
+    @property
+    def landed_state(self) -> LandedState:
+        """On the ground, in the air, taking off or landing."""
+        if self.land_detector.landed:
+            return LandedState.ON_GROUND
+        return {Mode.TAKEOFF: LandedState.TAKEOFF, Mode.LAND: LandedState.LANDING}.get(self.mode, LandedState.IN_AIR)
 
     @property
     def attitude_sp_count(self) -> int:

@@ -10,6 +10,7 @@ import math
 from sitl.failsafe import Action, Failsafe, Links
 from sitl.failure_detector import TiltDetector
 from sitl.flight_control import FlightControl
+from sitl.ground_contact import GroundContact
 from sitl.land_detector import LandDetector, Motion
 from sitl.landing_watch import LandingWatch, land_limits
 from sitl.manual_input import ManualInput
@@ -19,13 +20,11 @@ from sitl.modes import (
     NEVER_ARM,
     STICK_MODES,
     Home,
-    LandedState,
     Mode,
     Result,
     Severity,
     Text,
 )
-from sitl.navigator import Navigator
 from sitl.parameters import ParameterTable
 from sitl.plant import Plant
 from sitl.preflight import health_problem, mode_problem, stick_problem
@@ -35,6 +34,7 @@ from sitl.setpoints import Reposition
 READY_US = 2_000_000
 """Vehicle time until sensors and estimator count as healthy, us."""
 
+_TELL_WHY_US = 400_000
 _STICKS_OVER_AUTO, _STICKS_OVER_OFFBOARD = 1, 2
 
 
@@ -76,30 +76,18 @@ class Commander:
         self._after_disarming = Mode.LOITER
         self._texts: list[Text] = []
         self._offboard_us: int | None = None
-        self._gcs_us: int | None = None
-        self._gcs_lost = False
+        self._gcs = GroundContact(parameters)
         self._action = Action.NONE
         self._takeoff_amsl_m: float | None = None
         self._tilt_warned = False
         self._home_here = True
+        self._told_why = False
         self._land_limits = land_limits(parameters)
 
     @property
     def ready(self) -> bool:
         """Would it arm, here and in this mode? In flight: is it healthy?"""
         return self.healthy and (self.armed or not (self._health_problem() or self._mode_problem(self.mode)))
-
-    @property
-    def navigator(self) -> Navigator:
-        """Where the modes that hold a position want to be."""
-        return self.control.navigator
-
-    @property
-    def landed_state(self) -> LandedState:
-        """On the ground, in the air, taking off or landing."""
-        if self.land_detector.landed:
-            return LandedState.ON_GROUND
-        return {Mode.TAKEOFF: LandedState.TAKEOFF, Mode.LAND: LandedState.LANDING}.get(self.mode, LandedState.IN_AIR)
 
     def take_texts(self) -> list[Text]:
         """Texts since the last call."""
@@ -112,7 +100,7 @@ class Commander:
 
     def gcs_heard(self) -> None:
         """A ground station is there."""
-        self._gcs_us = self._now_us
+        self._gcs.heard(self._now_us)
 
     # -- commands ----------------------------------------------------------------------------------------------
 
@@ -131,8 +119,9 @@ class Commander:
         if sticks:
             return self._refuse(f"Arming denied: {sticks}\t")
         health = self._health_problem()
-        if health:
+        if health and (self.healthy or not self._told_why):
             self.say(Severity.CRITICAL, f"Preflight Fail: {health}")
+            self._told_why = True
         problem = health or self._mode_problem(self.mode)
         if problem:
             return self._refuse("Arming denied: Resolve system health failures first\t", problem)
@@ -143,7 +132,7 @@ class Commander:
         self._landing.on_arm(self._now_us)
         if self._home_here:
             self._set_home()
-        self.navigator.on_arm(self._now_us)
+        self.control.navigator.on_arm(self._now_us)
         self.say(Severity.INFO, "Armed by external command\t")
         self._begin(self.mode, self.mode)
         return Result.ACCEPTED
@@ -188,14 +177,14 @@ class Commander:
         """Hold, and go to a place first. where: NaN keeps what is."""
         result = self.command_mode(Mode.LOITER)
         if result is Result.ACCEPTED and self.armed:
-            self.navigator.reposition(where)
+            self.control.navigator.reposition(where)
         return result
 
     def command_orbit(self, where: Reposition, *, radius_m: float, speed_m_s: float) -> Result:
         """Fly a circle round a place, or round here. radius_m: below 0 is anticlockwise; NaN takes NAV_LOITER_RAD."""
         result = self.command_mode(Mode.ORBIT, explain=False)
         if result is Result.ACCEPTED and self.armed:
-            self.navigator.orbit(where._replace(speed_m_s=speed_m_s), radius_m)
+            self.control.navigator.orbit(where._replace(speed_m_s=speed_m_s), radius_m)
         return result
 
     def command_mission_start(self) -> Result:
@@ -237,12 +226,13 @@ class Commander:
     def think(self, now_us: int) -> None:
         """Look at everything once and decide. now_us: vehicle time, us."""
         self._now_us = now_us
-        if not self.healthy and now_us >= READY_US:
-            self.healthy = True
-            self._set_home()
+        if not self.healthy:
+            self._start_up()
         self._detect_landing()
         self._detect_tilt()
-        self._detect_gcs()
+        said = self._gcs.update(now_us)
+        if said:
+            self.say(Severity.INFO, said)
         self.manual.update(now_us)
         self.control.sticks = self.manual.sticks
         if not self.armed:
@@ -261,6 +251,17 @@ class Commander:
         if not self.terminated:
             self._act()
 
+    def _start_up(self) -> None:
+        """Wait for the estimator; why one has to is said once."""
+        if self.home is None:
+            self._set_home()
+        if not self._told_why and self._now_us >= _TELL_WHY_US:
+            self._told_why = True
+            self.say(Severity.CRITICAL, f"Preflight Fail: {self._health_problem()}")
+        if self._now_us >= READY_US:
+            self.healthy = True
+            self._set_home()
+
     def _detect_landing(self) -> None:
         if self.land_detector.flies(self.control.thrust_sp, self._land_limits):
             return
@@ -272,7 +273,7 @@ class Commander:
         p, q, r = self.control.state["rates"][0].tolist()
         n, e, d = self.control.velocity.tolist()
         held = self.control.climb_controlled
-        descending = held and self.navigator.descending
+        descending = held and self.control.navigator.descending
         return Motion(self.control.thrust_sp, (n, e, d), (p, q, r), (fx, fy, fz), held, descending)
 
     def _detect_tilt(self) -> None:
@@ -291,16 +292,6 @@ class Commander:
         elif not self._tilt_warned:
             self._tilt_warned = True
             self.say(Severity.CRITICAL, "Attitude failure detected\t")
-
-    def _detect_gcs(self) -> None:
-        if self._gcs_us is None:
-            return
-        lost = self._now_us - self._gcs_us > float(self.parameters.get("COM_DL_LOSS_T")) * 1e6
-        if lost and not self._gcs_lost:
-            self.say(Severity.INFO, "Connection to ground station lost\t")
-        elif self._gcs_lost and not lost:
-            self.say(Severity.INFO, "GCS connection regained\t")
-        self._gcs_lost = lost
 
     def _sticks_take_over(self) -> None:
         """A pilot who moves the sticks in a mode that flies by itself gets Position (COM_RC_OVERRIDE)."""
@@ -330,7 +321,7 @@ class Commander:
             self._begin(choice.mode, self.mode)
 
     def _links(self) -> Links:
-        return Links(self._gcs_lost, self.manual.sticks is None, not self.offboard_fresh())
+        return Links(self._gcs.lost, self.manual.sticks is None, not self.offboard_fresh())
 
     def offboard_fresh(self) -> bool:
         """Are Offboard's set-points coming (COM_OF_LOSS_T)?"""
@@ -341,8 +332,7 @@ class Commander:
     # -- transitions -------------------------------------------------------------------------------------------
 
     def _health_problem(self) -> str:
-        no_gcs = int(self.parameters.get("NAV_DLL_ACT")) > 0 and (self._gcs_us is None or self._gcs_lost)
-        return health_problem(self.healthy, self.terminated, self.control.motor_count, no_gcs)
+        return health_problem(self.healthy, self.terminated, self.control.motor_count, self._gcs.missed)
 
     def _mode_problem(self, mode: Mode, *, arming: bool = True) -> str:
         if arming and mode in NEVER_ARM:
@@ -380,7 +370,7 @@ class Commander:
         self.control.begin(self._now_us, mode, before, home=self.home, landed=self.land_detector.landed)
         if mode is Mode.TAKEOFF:
             wish_m = self._takeoff_amsl_m
-            self._texts += self.navigator.aim(None if wish_m is None else ORIGIN[2] - wish_m)
+            self._texts += self.control.navigator.aim(None if wish_m is None else ORIGIN[2] - wish_m)
 
     def _disarm(self, text: str) -> None:
         self.armed = False
@@ -390,7 +380,7 @@ class Commander:
         self._home_here = True
         self._action = Action.NONE
         self.control.stop()
-        self.navigator.on_disarm()
+        self.control.navigator.on_disarm()
         self.say(Severity.INFO, text)
         self.mode = self.intended = self._after_disarming
 

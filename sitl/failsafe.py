@@ -66,6 +66,7 @@ _BY_OFFBOARD_LOSS = {
 _NO_DELAY_S = 0.1
 _DELAYED = (Action.RTL, Action.LAND, Action.DESCEND)
 _EXCEPT_MISSION, _EXCEPT_HOLD, _EXCEPT_OFFBOARD = 1, 2, 4
+_LONGEST_US = 3.6e9
 _RECOVERY = 4
 """Delay that a failsafe used up comes back at a quarter of the speed."""
 
@@ -154,14 +155,14 @@ class Failsafe:
     def _wait(self, now_us: int, action: Action) -> int:
         """Return for how long an action still waits in Hold, us."""
         passed_us, self._last_us = now_us - self._last_us, now_us
-        whole_us = int(float(self._parameters.get("COM_FAIL_ACT_T")) * 1e6)
+        whole_us = float(self._parameters.get("COM_FAIL_ACT_T")) * 1e6
         if action not in _DELAYED:
             self._used_us = max(0, self._used_us - passed_us // _RECOVERY)
             return 0
         if not whole_us > _NO_DELAY_S * 1e6 or self._used_us >= whole_us:
             return 0
         self._used_us += passed_us
-        return max(0, whole_us - self._used_us)
+        return max(0, round(min(_LONGEST_US, whole_us - self._used_us)))
 
     def _excepted(self, parameter: str, intended: Mode) -> bool:
         bits = int(self._parameters.get(parameter))

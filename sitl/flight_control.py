@@ -187,10 +187,6 @@ class FlightControl:
         if mode is Mode.OFFBOARD and (stopped or self.by_position):
             self.fly_setpoint()
 
-    def begin_holding(self) -> None:
-        """A mode that holds a position begins here."""
-        self.navigator.enter(self._plant.position_ned(), self._plant.velocity_ned(), self._yaw())
-
     # -- every tick --------------------------------------------------------------------------------------------
 
     def run(self) -> NDArray[np.float64]:
@@ -205,9 +201,11 @@ class FlightControl:
         """Let a mode choose the set-point that is flown from the next tick on.
 
         Args:
-            now_us: vehicle time. mode: any but Offboard by attitude or rates. landing: is it on the ground?
+            now_us: vehicle time. mode: any; Offboard by attitude or rates is left alone. landing: is it on the ground?
             home: where Return goes and heights are counted from.
         """
+        if mode is Mode.OFFBOARD and self._guide.request is None:
+            return
         mode = flown_as(mode)
         if mode in ATTITUDE_BY_STICK:
             self._fly_sticks(now_us, mode, landing.landed)
@@ -229,10 +227,6 @@ class FlightControl:
             landed=landing.landed,
         )
         self._run_position(now_us)
-
-    def hold_position(self, now_us: int, mode: Mode, landing: LandDetector, home_down: float) -> None:
-        """`guide` with no more of home than its height in the local frame, m (down)."""
-        self.guide(now_us, mode, landing, Home(0.0, 0.0, 0.0, (0.0, 0.0, home_down), (1.0, 0.0, 0.0, 0.0)))
 
     def _yaw(self) -> float:
         yaw: float = to_euler(tuple(self._plant.quat.tolist()))[2]
@@ -314,5 +308,6 @@ class FlightControl:
         vn, ve, vd = state["vel_sp"].tolist()
         an, ae, ad = state["acc_sp"].tolist()
         yaw = float(request["yaw_sp"]) if used else math.nan
-        rate = self.navigator.track.yaw_rate if used else math.nan
+        turn = self.navigator.track.yaw_rate
+        rate = (turn if math.isfinite(turn) else 0.0) if used else math.nan
         return PositionSetpoint(now_us, (n, e, d), (vn, ve, vd), (an, ae, ad), yaw, rate, self._ticks)

@@ -21,8 +21,7 @@ from sitl.position_control import POSITION_INPUT
 from sitl.sensors import ORIGIN, local_position
 from sitl.setpoints import Reposition
 from sitl.stick_motion import MotionSetpoint
-from sitl.takeoff import Takeoff
-from sitl.takeoff import TakeoffState as TakeoffState
+from sitl.takeoff import Takeoff, TakeoffState
 from sitl.track import Track
 
 _MOVING = (LegKind.GO, LegKind.CIRCLE)

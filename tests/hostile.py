@@ -363,12 +363,12 @@ class Watched:
         assert self.command(400, 1.0) == 0
         nan = math.nan
         assert self.command(22, 0.0, 0.0, 0.0, nan, nan, nan, self.vehicle.origin[2] + height_m) == 0
-        for _ in range(40):
+        for _ in range(100):
             self.run(0.5)
             if self.vehicle.autopilot.mode == 4:
                 self.run(1.0)
                 return self
-        raise AssertionError("no Hold within 20 s")
+        raise AssertionError("no Hold within 50 s")
 
     def state(self) -> Fields:
         """What only a valid command changes."""

@@ -28,8 +28,15 @@ WARM_S, FLIGHT_S = 3.0, 12.0
 MOST_OFF = 0.02
 SLOWEST_HZ = 10.0
 MODES: tuple[LinkMode, ...] = ("gcs", "onboard")
-# Sent when there is something new, not at a fixed rate; the last only while navigating.
-ON_NEWS = {"ATTITUDE_TARGET", "POSITION_TARGET_LOCAL_NED", "GPS_RAW_INT", "RC_CHANNELS", "MANUAL_CONTROL"}
+# Sent when there is something new or somewhere to go, not at a fixed rate.
+ON_NEWS = {
+    "ATTITUDE_TARGET",
+    "POSITION_TARGET_LOCAL_NED",
+    "POSITION_TARGET_GLOBAL_INT",
+    "GPS_RAW_INT",
+    "RC_CHANNELS",
+    "MANUAL_CONTROL",
+}
 
 
 def asked_hz(mode: LinkMode) -> dict[str, float]:

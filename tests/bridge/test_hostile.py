@@ -263,16 +263,45 @@ def test_parameters_of_any_bits_do_not_bring_the_process_down(seed: int) -> None
     assert watched.answers(0, ANSWER_TICKS)
 
 
-def test_one_parameter_at_a_time_without_a_number() -> None:
-    """Each float the vehicle obeys as NaN and as infinity, in flight, then back."""
+FLOATS = tuple(name for name, spec in parameter_specs().items() if spec.type == "REAL32" and spec.obeyed)
+NO_NUMBERS = (b"\0\0\xc0\x7f", b"\0\0\x80\x7f", b"\0\0\x80\xff", b"\xff\xff\x7f\x7f")
+STICK_MODES = (1, 2, 3)
+
+
+@pytest.mark.parametrize("part", range(10))
+def test_no_law_stumbles_over_a_parameter_that_is_no_number(part: int) -> None:
+    """Each float the vehicle obeys as NaN, infinite or huge, a few at a time, in every way there is to fly."""
+    rng = random.Random(part)
     watched = Watched().hover()
-    for name, spec in parameter_specs().items():
-        if spec.type == "INT32" or not spec.obeyed:
-            continue
-        kept = watched.vehicle.parameters.raw(name)
-        for value in (b"\0\0\xc0\x7f", b"\0\0\x80\x7f", b"\xff\xff\x7f\xff", kept):
+    watched.send("PARAM_SET", param_id="NAV_DLL_ACT", param_value=b"\2\0\0\0", param_type=6, **TARGET)
+    for number in range(4):
+        names = FLOATS[part::10][number::4]
+        kept = {name: watched.vehicle.parameters.raw(name) for name in names}
+        for name in names:
+            value = rng.choice(NO_NUMBERS)
             watched.send("PARAM_SET", param_id=name, param_value=value, param_type=9, **TARGET)
-            watched.tick(3)
+        for mode in STICK_MODES:
+            watched.command(176, 1.0, float(mode))
+            for _ in range(6):
+                watched.send("MANUAL_CONTROL", target=US, x=600, y=-500, z=700, r=300)
+                watched.run(0.05)
+        here = watched.vehicle.origin
+        watched.command(192, -1.0, 1.0, 0.0, math.nan, here[0] + 1e-4, here[1], here[2] + 20.0)
+        watched.run(0.3)
+        target = {"x": 5.0, "y": 5.0, "z": -10.0, "type_mask": 0xDF8, "coordinate_frame": 1, **TARGET}
+        for _ in range(4):
+            watched.send("SET_POSITION_TARGET_LOCAL_NED", **target)
+            watched.run(0.05)
+            watched.command(176, 1.0, 6.0)
+        watched.run(0.8)  # Offboard loses its set-points
+        for command in (20, 21):
+            watched.command(command)
+            watched.run(0.3)
+        watched.run(2.0, heartbeats=False)
+        watched.command(22, 0.0, 0.0, 0.0, math.nan, math.nan, math.nan, here[2] + 10.0)
+        for name, value in kept.items():
+            watched.send("PARAM_SET", param_id=name, param_value=value, param_type=9, **TARGET)
+        watched.run(1.0)
     assert watched.answers(0, ANSWER_TICKS)
 
 
@@ -291,6 +320,20 @@ def test_a_flood_on_one_link_does_not_keep_the_other_waiting() -> None:
             pass
     waiting = sum(map(len, watched.links[0].link._inbox))  # type: ignore[attr-defined]
     assert weight(watched.server) - before < waiting + 80 * 10_000 + 2_000_000
+
+
+def test_a_tick_takes_a_bounded_number_of_bytes() -> None:
+    """Datagrams as large as there are, full of requests: what one tick takes of them does not stop the vehicle."""
+    watched = Watched()
+    watched.run(1.0)
+    request = watched.stations[0].encode("PARAM_REQUEST_READ", param_index=3, **TARGET)
+    for _ in range(20):
+        watched.put(request * (65_000 // len(request)))
+    good = watched.good[0]
+    watched.tick()
+    assert 0 < watched.good[0] - good <= 2 * 65_535
+    watched.tick(30)
+    assert watched.answers(1, ANSWER_TICKS)
 
 
 @pytest.mark.parametrize("kind", ["everything", "damaged", "requests"])
