@@ -110,8 +110,10 @@ class Services:
         table = vehicle.parameters
         self._corrector = ParameterCorrector(table)
         self._stored = None if files.parameters is None else ParameterFile(files.parameters, table, sysid)
-        for notice in () if self._stored is None else self._stored.notices:
-            say(Severity.WARNING, notice)
+        if self._stored is not None:
+            table.reset("MAV_SYS_ID")  # the links decide, not the file of another instance
+            for notice in self._stored.notices:
+                say(Severity.WARNING, notice)
         if files.signing_key is not None and "MAV_SIGN_CFG" not in table.changed():
             table.set("MAV_SIGN_CFG", _SIGN_ALWAYS)
         address = {"system_id": sysid, "component_id": compid}

@@ -24,8 +24,9 @@ from bridge.services import VehicleFiles
 from bridge.sitl_links import banner, close_links, default_urls, link_urls, open_links
 from bridge.vehicle_server import ServerLink, VehicleServer
 from sitl.errors import FileError, UsageError
+from sitl.parameters import ParameterTable
 from sitl.profile import get_profile
-from sitl.vehicle import Vehicle
+from sitl.vehicle import Vehicle, airframe_parameters
 from sitl.vehicle_spec import DEFAULT_SCALING, VehicleModel, resolve_vehicle
 
 __all__ = [
@@ -149,7 +150,10 @@ def build_vehicle(spec: str | VehicleModel, instance: int, options: SitlOptions)
     """
     own = options.of_instance(instance)
     model = resolve_vehicle(spec, own.scaling) if isinstance(spec, str) else spec
-    vehicle = Vehicle(model, get_profile(own.profile), seed=own.seed)
+    profile = get_profile(own.profile)
+    # a default of this vehicle, so that no file of parameters keeps it
+    table = ParameterTable({**airframe_parameters(model, profile), "MAV_SYS_ID": instance + 1})
+    vehicle = Vehicle(model, profile, seed=own.seed, parameters=table)
     links = open_links(own.links, instance=instance)
     files = VehicleFiles(logs=own.log_dir, parameters=own.state, signing_key=own.signing_key)
     try:
@@ -220,6 +224,6 @@ def serve(
 
 
 def _server(vehicle: Vehicle, links: Sequence[ServerLink], files: VehicleFiles | None = None) -> VehicleServer:
-    if links:
+    if links and vehicle.parameters.get("MAV_SYS_ID") != links[0].connection.sysid:
         vehicle.parameters.set("MAV_SYS_ID", links[0].connection.sysid)
     return VehicleServer(vehicle, links, utc_boot_us=utc_us() - vehicle.time_us, files=files or VehicleFiles())

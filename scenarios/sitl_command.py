@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
 
 EXIT_OK, EXIT_FAILED = 0, 3
 LOOPBACK = "127.0.0.1"
+LOGS = "logs/ulog"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,8 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--log-dir",
         type=Path,
         metavar="DIR",
-        help="write flight logs (ULog) here; of several in DIR/0, DIR/1 ...",
+        help=f"write flight logs (ULog) here; of several in DIR/0, DIR/1 ... (default: {LOGS})",
     )
+    add("--no-log", action="store_true", help="write no flight logs")
     add("--signing-key", type=Path, metavar="FILE", help="MAVLink 2 signing key; MAV_SIGN_CFG says what is refused")
     add("--status", action="store_true", help="a status line every second, also where there is no terminal")
 
@@ -81,12 +84,13 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
         bind=sitl_links.check_bind(args.bind),
         links=tuple(args.link),
         state=args.state,
-        log_dir=args.log_dir,
+        log_dir=None if args.no_log else args.log_dir or Path(LOGS),
         signing_key=args.signing_key,
         several=len(specs) > 1,
     )
     sitl_links.check_links(options.links, bind=options.bind, count=len(specs))
-    check_files(options)
+    # where nobody said that logs should go, a folder that cannot be written costs the logs and nothing else
+    check_files(options if args.log_dir else dataclasses.replace(options, log_dir=None))
     _clock(args.speed)
     models = {spec: resolve_vehicle(spec, scaling) for spec in dict.fromkeys(specs)}
     if not is_warm():

@@ -187,7 +187,8 @@ def airframe_parameters(model: VehicleModel, profile: Profile) -> dict[str, floa
         model: rotors and hover thrust. profile: gyro filter cutoffs.
 
     Returns:
-        name -> value: CA_ROTOR_COUNT, CA_ROTORn_PX/PY/PZ/KM, MAV_TYPE, MPC_THR_HOVER, IMU_*_CUTOFF.
+        name -> value: CA_ROTOR_COUNT, CA_ROTORn_PX/PY/PZ/KM, MAV_TYPE, MPC_THR_HOVER, IMU_*_CUTOFF,
+        SDLOG_*.
     """
     rotors = model.airframe.rotors
     values: dict[str, float | int] = {

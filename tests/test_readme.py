@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fnmatch
 import io
 import json
 import re
 import socket
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from scenarios.table import COLUMNS as TABLE
 from scenarios.table import cells
 from scenarios.telemetry import COLUMNS
 from sitl.errors import FileError, LinkError, UsageError
-from sitl.modes import AVAILABLE, MODE_NAMES
+from sitl.modes import EXTERNAL_MODES, MODE_NAMES
 from sitl.parameters import ParameterTable
 from sitl.profile import PROFILES
 
@@ -193,18 +193,22 @@ def test_profiles() -> None:
 
 def test_parameters() -> None:
     parameters = ParameterTable()
-    count, idle = re.search(r"\*\*Parameters\*\*: (\d+),.*?do nothing yet: (.*?)\. A", README, re.DOTALL).groups()  # type: ignore[union-attr]
+    count, obeyed = re.search(r"\*\*Parameters\*\*: (\d+),.*?acts on (\d+) of", README, re.DOTALL).groups()  # type: ignore[union-attr]
     assert int(count) == len(parameters)
-    patterns = re.findall(r"[A-Z][A-Z0-9_*]+", idle)
-    named = {name for name in parameters.names for pattern in patterns if fnmatch.fnmatchcase(name, pattern)}
-    assert named == {name for name in parameters.names if not parameters.spec(name).obeyed}
+    assert int(obeyed) == sum(parameters.spec(name).obeyed for name in parameters.names)
 
 
 def test_modes() -> None:
-    modes, absent = re.search(r"\*\*Modes\*\*: (.*?) with .*?Not yet: (.*?);", README, re.DOTALL).groups()  # type: ignore[union-attr]
-    assert set(re.findall(r"[A-Z]\w+", modes)) == {MODE_NAMES[mode] for mode in AVAILABLE}
-    own = {"Descend", "Termination"}  # entered by failsafes only
-    assert set(re.findall(r"[A-Z]\w+", absent)) == set(MODE_NAMES.values()) - {MODE_NAMES[m] for m in AVAILABLE} - own
+    modes = re.search(r"\*\*Modes\*\*: (.*?)\n- \*\*", README, re.DOTALL).group(1)  # type: ignore[union-attr]
+    named = re.sub(r"\s+", " ", modes)
+    assert [name for mode, name in MODE_NAMES.items() if mode not in EXTERNAL_MODES and name not in named] == []
+
+
+def test_every_deviation_from_a_px4_is_listed_and_no_other() -> None:
+    with (ROOT / "tests/data/px4_answers_deviations.toml").open("rb") as file:
+        reasons = {entry["reason"] for entry in tomllib.load(file)["deviation"]}
+    listed = re.search(r"\*\*Where it answers otherwise.*?\n\n(.*?)\n\n", README, re.DOTALL).group(1)  # type: ignore[union-attr]
+    assert {re.sub(r"\s+", " ", line).removesuffix(".") for line in listed.removeprefix("- ").split("\n- ")} == reasons
 
 
 def test_run_json_and_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

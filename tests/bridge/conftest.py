@@ -53,8 +53,10 @@ class Ground:
 class Flight:
     """A real vehicle, its server and a ground station on each link."""
 
-    def __init__(self, *modes: Any, heartbeats: bool = True, strict: bool = True) -> None:
-        self.vehicle = Vehicle(resolve_vehicle("ant-x"), get_profile("sitl"))
+    def __init__(
+        self, *modes: Any, heartbeats: bool = True, strict: bool = True, vehicle: str = "ant-x", **options: Any
+    ) -> None:
+        self.vehicle = Vehicle(resolve_vehicle(vehicle), get_profile("sitl"))
         self.grounds: list[Ground] = []
         self.links: list[ServerLink] = []
         for number, mode in enumerate(modes or ("gcs",)):
@@ -62,7 +64,7 @@ class Flight:
             self.links.append(ServerLink(near, Connection(1, 1, datagram=True), number, mode))
             self.grounds.append(Ground(far, *((255, 190) if number == 0 else (245, 191))))
         self.heartbeats = heartbeats
-        self.server = VehicleServer(self.vehicle, self.links, strict=strict)
+        self.server = VehicleServer(self.vehicle, self.links, strict=strict, **options)
 
     @property
     def ground(self) -> Ground:
@@ -99,7 +101,8 @@ class Flight:
         self.forget()
         self.grounds[link].send(name, **fields)
         self.run(wait_s)
-        streamed = set() if only else set(self.links[link].schedule.intervals()) | {"STATUSTEXT"}
+        unasked = {"STATUSTEXT", "EVENT", "CURRENT_EVENT_SEQUENCE", "MISSION_CURRENT"}
+        streamed = set() if only else set(self.links[link].schedule.intervals()) | unasked
         heard = [message for _, message in self.grounds[link].heard]
         return [one for one in heard if (one.name in only if only else one.name not in streamed)]
 

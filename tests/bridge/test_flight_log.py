@@ -51,11 +51,11 @@ TOPICS = {
 
 
 class Logged:
-    """A vehicle with a log."""
+    """A vehicle with a log, from arming to disarming unless SDLOG_MODE says otherwise."""
 
     def __init__(self, directory, *, vehicle="ant-x", parameters=None, **options):
         self.vehicle = Vehicle(resolve_vehicle(vehicle), get_profile("sitl"))
-        for name, value in (parameters or {}).items():
+        for name, value in ({"SDLOG_MODE": 0} | (parameters or {})).items():
             self.vehicle.parameters.set(name, value)
         self.said = []
         self.directory = directory

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from bridge.streams import HEARTBEAT_ID, OFF, STREAMS, Schedule
 
 TICK_US = 4000
-ATTITUDE, ATTITUDE_TARGET, SYS_STATUS, HIGHRES_IMU, ORIGIN = 30, 83, 1, 105, 49
+ATTITUDE, ATTITUDE_TARGET, SYS_STATUS, HIGHRES_IMU, ORIGIN, ESC_INFO = 30, 83, 1, 105, 49, 290
 
 
 class Stub:
@@ -113,8 +113,24 @@ class TestIntervals:
         schedule.set_interval(HIGHRES_IMU, 0, 0)
         assert schedule.interval_us(HIGHRES_IMU) == OFF
 
-    def test_memory_starts_like_onboard(self) -> None:
-        assert Schedule("memory").intervals() == Schedule("onboard").intervals()
+    def test_memory_starts_like_onboard_without_what_nobody_looks_at(self) -> None:
+        memory, onboard = Schedule("memory").intervals(), Schedule("onboard").intervals()
+        unwatched = {
+            "ESC_INFO",
+            "ESC_STATUS",
+            "OPEN_DRONE_ID_LOCATION",
+            "OPEN_DRONE_ID_SYSTEM",
+            "POSITION_TARGET_GLOBAL_INT",
+        }
+        assert set(onboard) - set(memory) == unwatched
+        assert memory == {name: interval_us for name, interval_us in onboard.items() if name not in unwatched}
+
+    def test_default_of_a_memory_link(self) -> None:
+        schedule = Schedule("memory")
+        for message_id, interval_us in ((ATTITUDE, 10_000), (ESC_INFO, OFF)):
+            schedule.set_interval(message_id, 123_456, 0)
+            schedule.set_interval(message_id, 0, 0)
+            assert schedule.interval_us(message_id) == interval_us
 
     def test_off_stops_and_on_starts_with_the_next_tick(self, source: Any) -> None:
         schedule = only(ATTITUDE, TICK_US)

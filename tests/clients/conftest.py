@@ -40,11 +40,11 @@ def sitl(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sitl]:
 
 
 @pytest.fixture
-def relay() -> Iterator[Callable[[int], int]]:
+def relay() -> Iterator[Callable[..., LossyRelay]]:
     """Return the function that puts a network that loses datagrams in front of a client's port."""
     with ExitStack() as stack:
 
-        def start(client_port: int, *, loss: float = 0.1, seed: int = 1) -> int:
-            return stack.enter_context(LossyRelay(client_port, loss, seed)).port
+        def start(client_port: int, *, loss: float = 0.1, seed: int = 1) -> LossyRelay:
+            return stack.enter_context(LossyRelay(client_port, loss, seed))
 
         yield start

@@ -17,12 +17,17 @@ class LossyRelay:
         client_port: of the client, on the loopback.
         loss: share of datagrams that vanish in each direction.
         seed: the same seed and traffic lose the same datagrams.
+
+    Attributes:
+        port: where the vehicle expects its ground station.
+        loss: may be changed at any time.
+        lost: datagrams so far that nobody got.
     """
 
     def __init__(self, client_port: int, loss: float, seed: int) -> None:
         self._client = ("127.0.0.1", client_port)
         self._vehicle: tuple[str, int] | None = None
-        self._loss = loss
+        self.loss = loss
         self._chance = {side: random.Random(f"{seed} {side}") for side in ("vehicle", "client")}
         self._to_vehicle = _socket()
         self._to_client = _socket()
@@ -59,7 +64,7 @@ class LossyRelay:
                     self.lost += 1
 
     def _passes(self, side: str) -> bool:
-        lost = self._chance[side].random() < self._loss
+        lost = self._chance[side].random() < self.loss
         self.lost += lost
         return not lost
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from lossy_relay import LossyRelay
 from mavproxy_console import Console
 from mavsdk_script import Craft, fly, until
 from mavutil_script import REAL32, open_station
@@ -23,26 +24,36 @@ from mavsdk.asyncio.plugins.log_files import LogFilesAsync  # noqa: E402
 from mavsdk.asyncio.plugins.mission_raw import MissionRawAsync  # noqa: E402
 from mavsdk.plugins.mission_raw.mission_raw import MissionItem  # noqa: E402
 
-Start = Callable[..., int]
+
+@dataclass
+class BadNetwork:
+    """A vehicle behind a network that loses datagrams: where it is heard, where it keeps its logs."""
+
+    port: int
+    relay: LossyRelay
+    logs: Path
 
 
 @pytest.fixture
-def port(sitl: Callable[..., VehicleProcess], relay: Start, tmp_path: Path) -> int:
-    """Where a client hears a vehicle through a bad network; the vehicle keeps logs."""
-    client_port = free_port()
-    sitl("--log-dir", str(tmp_path), "--link", f"udpout://127.0.0.1:{relay(client_port)}#onboard", speed=2.0)
-    return client_port
+def network(
+    sitl: Callable[..., VehicleProcess], relay: Callable[..., LossyRelay], tmp_path: Path
+) -> Iterator[BadNetwork]:
+    port, logs = free_port(), tmp_path / "logs"
+    way = relay(port)
+    vehicle = sitl("--log-dir", str(logs), "--link", f"udpout://127.0.0.1:{way.port}#onboard", speed=2.0)
+    yield BadNetwork(port, way, logs)
+    vehicle.stop()
 
 
-def test_mavsdk(port: int, tmp_path: Path) -> None:
+def test_mavsdk_parameters_and_missions(network: BadNetwork) -> None:
     async def script(craft: Craft) -> None:
         param = craft.param
-        for value in (0.11, 0.12, 0.13, 0.14, 0.15):
-            await param.set_param_float("MC_ROLLRATE_P", value)
-            assert await param.get_param_float("MC_ROLLRATE_P") == pytest.approx(value)
         everything = await param.get_all_params()
         names = {one.name for one in [*everything.int_params, *everything.float_params]}
         assert names == set(parameter_specs())
+        for value in (0.11, 0.12, 0.13, 0.14, 0.15):
+            await param.set_param_float("MC_ROLLRATE_P", value)
+            assert await param.get_param_float("MC_ROLLRATE_P") == pytest.approx(value)
 
         home = await until(craft.telemetry.subscribe_home(), lambda one: math.isfinite(one.latitude_deg))
         place = round(home.latitude_deg * 1e7), round(home.longitude_deg * 1e7)
@@ -54,7 +65,21 @@ def test_mavsdk(port: int, tmp_path: Path) -> None:
         await mission.upload_mission(items)
         assert [one.z for one in await mission.download_mission()] == [one.z for one in items]
 
-        ftp = FtpAsync(craft.system)
+        await craft.ready()
+        await craft.action.arm()
+        await until(craft.telemetry.subscribe_armed(), bool)
+        await craft.action.disarm()
+        await craft.disarmed()
+        assert network.relay.lost > 100
+
+    fly(network.port, script, 90)
+
+
+def test_mavsdk_files_and_logs(network: BadNetwork, tmp_path: Path) -> None:
+    async def script(craft: Craft) -> None:
+        # The log from the start on ends here: MAVSDK asks for what was lost piece by piece.
+        await craft.param.set_param_int("SDLOG_MODE", -1)
+        ftp, logs = FtpAsync(craft.system), LogFilesAsync(craft.system)
         name = next(
             entry.name
             for entry in (await ftp.list_directory("/etc/extras")).entries
@@ -66,29 +91,20 @@ def test_mavsdk(port: int, tmp_path: Path) -> None:
             async for _ in ftp.download(f"/etc/extras/{name}", str(folder), burst):
                 pass
             assert await ftp.are_files_identical(str(folder / name), f"/etc/extras/{name}")
-
-        await craft.ready()
-        await craft.action.arm()
-        await asyncio.sleep(0.5)
-        await craft.action.disarm()
-        await craft.disarmed()
-        logs = LogFilesAsync(craft.system)
         entries = await logs.get_entries()
         assert len(entries) == 1
         async for _ in logs.download_log_file(entries[0], str(tmp_path / "flight.ulg")):
             pass
-        assert (tmp_path / "flight.ulg").stat().st_size == entries[0].size_bytes
-        assert (tmp_path / "flight.ulg").read_bytes() == next(
-            path.read_bytes() for path in tmp_path.rglob("*.ulg") if path.name != "flight.ulg"
-        )
+        [kept] = network.logs.rglob("*.ulg")
+        assert (tmp_path / "flight.ulg").read_bytes() == kept.read_bytes()
 
-    fly(port, script, 90)
+    fly(network.port, script, 90)
 
 
-def test_pymavlink(port: int, tmp_path: Path) -> None:
+def test_pymavlink(network: BadNetwork, tmp_path: Path) -> None:
     from pymavlink import mavftp, mavparm
 
-    station = open_station(port)
+    station = open_station(network.port)
     try:
         assert station.wait_heartbeat(timeout=30) is not None
         store = mavparm.MAVParmDict()
@@ -104,15 +120,24 @@ def test_pymavlink(port: int, tmp_path: Path) -> None:
         station.close()
 
 
-def test_mavproxy(port: int, tmp_path: Path) -> None:
-    with Console(port, tmp_path) as mavproxy:
+def test_mavproxy(network: BadNetwork, tmp_path: Path) -> None:
+    # It repeats ten missing parameters every other second: the first list comes whole.
+    network.relay.loss = 0.0
+    with Console(network.port, tmp_path) as mavproxy:
         assert mavproxy.parameters() == len(parameter_specs())
-        mavproxy.say("param set MC_ROLL_P 7.25")
-        for _ in range(20):
-            mavproxy.say("param fetch MC_ROLL_P")
-            try:
-                if mavproxy.until(r"MC_ROLL_P = (\S+)", limit_s=0.5)[1].startswith("7.25"):
-                    return
-            except AssertionError:
-                continue
-        raise AssertionError("MC_ROLL_P never became 7.25")
+        network.relay.loss = 0.1
+        for value in ("7.25", "7.5", "7.75"):
+            mavproxy.say(f"param set MC_ROLL_P {value}")
+            assert shown(mavproxy, "MC_ROLL_P", value)
+
+
+def shown(mavproxy: Console, name: str, value: str) -> bool:
+    """Ask until the vehicle's value is this: a request may be lost."""
+    for _ in range(20):
+        mavproxy.say(f"param fetch {name}")
+        try:
+            if mavproxy.until(rf"{name} = (\S+)", limit_s=0.5)[1].startswith(value):
+                return True
+        except AssertionError:
+            continue
+    return False

@@ -17,9 +17,9 @@ pytestmark = pytest.mark.client
 
 mavio = pytest.importorskip("mavio")
 
-from mavio.mavlink import CommandLongBuilder  # noqa: E402
 from mavio.metadata import fetch_parameter_metadata  # noqa: E402
 from mavio.node import MavNode  # noqa: E402
+from mavio.serializer import CommandLongBuilder  # noqa: E402
 
 HEARTBEAT, ATTITUDE, GLOBAL_POSITION_INT = 0, 30, 33
 ACCEPTED, TEMPORARILY_REJECTED, UNSUPPORTED = 0, 1, 3

@@ -81,6 +81,24 @@ def test_offboard_position_and_velocity(vehicle: VehicleProcess) -> None:
     fly(vehicle.port, script, 90)
 
 
+def test_go_there(vehicle: VehicleProcess) -> None:
+    async def script(craft: Craft) -> None:
+        telemetry = craft.telemetry
+        await craft.up()
+        home = await until(telemetry.subscribe_home(), lambda one: math.isfinite(one.latitude_deg))
+        north = home.latitude_deg + 8.0 / METRES_PER_DEGREE
+        await craft.action.goto_location(north, home.longitude_deg, home.absolute_altitude_m + 6.0, 90.0)
+        await until(
+            telemetry.subscribe_position(),
+            lambda one: abs(one.latitude_deg - north) * METRES_PER_DEGREE < 1.0 and one.relative_altitude_m > 5.5,
+        )
+        await until(telemetry.subscribe_heading(), lambda one: abs(one.heading_deg - 90.0) < 5.0)
+        await craft.action.set_current_speed(2.0)
+        await craft.down()
+
+    fly(vehicle.port, script, 90)
+
+
 def test_sticks_in_position_and_altitude(vehicle: VehicleProcess) -> None:
     async def script(craft: Craft) -> None:
         manual, telemetry = ManualControlAsync(craft.system), craft.telemetry
@@ -110,26 +128,8 @@ def test_sticks_in_position_and_altitude(vehicle: VehicleProcess) -> None:
             await until(telemetry.subscribe_attitude_euler(), lambda one: one.roll_deg > 4.0)
             sticks.y = 0.0
             await until(telemetry.subscribe_attitude_euler(), lambda one: abs(one.roll_deg) < 2.0)
-            await craft.action.hold()
-            await craft.mode("HOLD")
-            await craft.down()
-
-    fly(vehicle.port, script, 90)
-
-
-def test_go_there(vehicle: VehicleProcess) -> None:
-    async def script(craft: Craft) -> None:
-        telemetry = craft.telemetry
-        await craft.up()
-        home = await until(telemetry.subscribe_home(), lambda one: math.isfinite(one.latitude_deg))
-        north = home.latitude_deg + 8.0 / METRES_PER_DEGREE
-        await craft.action.goto_location(north, home.longitude_deg, home.absolute_altitude_m + 6.0, 90.0)
-        await until(
-            telemetry.subscribe_position(),
-            lambda one: abs(one.latitude_deg - north) * METRES_PER_DEGREE < 1.0 and one.relative_altitude_m > 5.5,
-        )
-        await until(telemetry.subscribe_heading(), lambda one: abs(one.heading_deg - 90.0) < 5.0)
-        await craft.action.set_current_speed(2.0)
+        # Nobody holds them any more, and NAV_RCL_ACT sends it home.
+        await craft.mode("RETURN_TO_LAUNCH")
         await craft.down()
 
     fly(vehicle.port, script, 90)

@@ -88,8 +88,9 @@ def test_a_flight_log_for_pyulog(vehicle: VehicleProcess, tmp_path: Path) -> Non
         entries = await logs.get_entries()
         assert len(entries) == 1
         assert entries[0].date.startswith("20")
-        progress = [step.progress async for step in logs.download_log_file(entries[0], str(path))]
+        progress = [step.progress async for _, step in logs.download_log_file(entries[0], str(path))]
         assert progress == sorted(progress)
+        assert progress[-1] == pytest.approx(1.0)
         assert path.stat().st_size == entries[0].size_bytes
 
     fly(vehicle.port, script, 90)

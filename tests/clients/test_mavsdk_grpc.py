@@ -14,7 +14,8 @@ from vehicle_process import VehicleProcess
 
 from sitl.parameters import parameter_specs
 
-pytestmark = pytest.mark.client
+# It finds its server by a part of importlib that is on its way out.
+pytestmark = [pytest.mark.client, pytest.mark.filterwarnings("ignore:path is deprecated:DeprecationWarning")]
 
 mavsdk_grpc = pytest.importorskip("mavsdk_grpc")
 

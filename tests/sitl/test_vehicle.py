@@ -146,7 +146,7 @@ class TestStudyProfile:
         made.run(10.0, lambda _: made.autopilot.offboard_attitude(from_euler(0.1, 0, 0), (0, 0, math.nan), 0.5))
         vehicle = made.vehicle
         assert abs(vehicle.estimate.euler()[0]) > math.radians(80.0)
-        assert made.said("Attitude failure detected")
+        assert made.said("Attitude failure detected\t")
         seen = [vehicle.gps().lat_deg, vehicle.gps().alt_m, vehicle.estimate.pressure_hpa()]
         seen += [*vehicle.estimate.mag_body(), *vehicle.estimate.accel_body()]
         seen += [*made.autopilot.motors, *made.autopilot.attitude_sp.rates]
