@@ -192,6 +192,18 @@ class Client:
         if not self.wait_until(lambda: self.target_system != 0 and self.drive.knows_time, timeout_s):
             raise PeerSilent(self.link.name, timeout_s, "a HEARTBEAT of an autopilot (component 1)")
 
+    def make_ready(self, timeout_s: float = 60.0) -> None:
+        """Choose Hold if the vehicle is on the ground in another mode, then `wait_ready`.
+
+        A vehicle that landed out of Offboard is in Offboard again, where no vehicle is ready without set-points.
+
+        Raises:
+            CommandRefused, PeerSilent, NotReady: as `set_mode` and `wait_ready`.
+        """
+        if not self.state.armed and self.state.nav_state != Mode.LOITER:
+            self.set_mode(Mode.LOITER)
+        self.wait_ready(timeout_s)
+
     def wait_ready(self, timeout_s: float = 60.0) -> None:
         """Wait for health, home and position, as one does before arming.
 

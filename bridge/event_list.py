@@ -8,6 +8,7 @@ says the same and the numbers in it.
 from __future__ import annotations
 
 import json
+import math
 import re
 import struct
 from dataclasses import dataclass
@@ -18,8 +19,9 @@ from sitl.modes import MODE_NAMES
 _COMPONENT = 1
 _FNV_START, _FNV_PRIME = 0x811C9DC5, 0x01000193
 _ARGUMENT_BYTES = 40
+_LARGEST_FLOAT32 = 3.4028234663852886e38
 _HOLE = re.compile(r"\{(\d)\}")
-_NUMBER = r"([-+]?[\d.]+|[-+]?nan|[-+]?inf)"
+_NUMBER = r"([-+]?\d+(?:\.\d*)?|[-+]?nan|[-+]?inf)"
 
 _SAID: dict[str, str] = {
     "armed": "Armed by external command",
@@ -120,7 +122,7 @@ def find_event(text: str) -> tuple[Event, bytes] | None:
     for event, pattern in _events():
         found = pattern.fullmatch(text)
         if found:
-            return event, b"".join(struct.pack("<f", float(part)) for part in found.groups())[:_ARGUMENT_BYTES]
+            return event, b"".join(_float32(part) for part in found.groups())[:_ARGUMENT_BYTES]
     return None
 
 
@@ -139,6 +141,11 @@ def events_json() -> bytes:
         "components": {str(_COMPONENT): {"namespace": "px4", "event_groups": {"default": {"events": events}}}},
     }
     return json.dumps(tree, sort_keys=True, separators=(",", ":")).encode()
+
+
+def _float32(text: str) -> bytes:
+    value = float(text)
+    return struct.pack("<f", math.copysign(math.inf, value) if abs(value) > _LARGEST_FLOAT32 else value)
 
 
 @cache

@@ -18,7 +18,7 @@ _FULL = 1000.0
 _NO_AXIS = 32767  # INT16_MAX: the joystick has no such axis
 _CHANNELS = 18
 _KEEP = 65535  # UINT16_MAX: this message says nothing of the channel
-_RELEASE = 0
+_RELEASE, _RELEASE_BEYOND_EIGHT = 0, 65534
 _STICKS = ("RC_MAP_ROLL", "RC_MAP_PITCH", "RC_MAP_YAW", "RC_MAP_THROTTLE")
 
 
@@ -56,7 +56,9 @@ class ManualControl:
         for number in range(_CHANNELS):
             width_us = getattr(msg, f"chan{number + 1}_raw")
             # the channels beyond eight are an extension: zero there means "not sent"
-            if width_us != _KEEP and (width_us != _RELEASE or number < 8):
+            if width_us == _RELEASE_BEYOND_EIGHT and number >= 8:
+                self._channels[number] = _RELEASE
+            elif width_us != _KEEP and (width_us != _RELEASE or number < 8):
                 self._channels[number] = width_us
         server.source.channels = tuple(self._channels)
         server.source.channels_us = server.vehicle.time_us

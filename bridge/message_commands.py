@@ -45,6 +45,7 @@ class MessageCommands:
     def _request(self, command: Command, message_id: int, index: int) -> Result:
         """Send a message on the link the command came from; its acknowledgement follows."""
         link, server = command.link, self._server
+        server.source.link = link
         if message_id == _MESSAGE_INTERVAL_ID:
             self._send_interval(link, index)
             return Result.ACCEPTED

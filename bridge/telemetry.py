@@ -47,6 +47,8 @@ RADIO, LOGGING = 0x10000, 0x1000000
 PRESENT = GYRO | ACCEL | MAG | BARO | GPS | XY_POSITION | MOTORS | LOGGING | BATTERY
 """What a PX4 multicopter in simulation says it has; it expects a radio even when there is none."""
 HEALTHY = PRESENT | ATTITUDE | AHRS
+STARTING = HEALTHY & ~(GPS | XY_POSITION | ATTITUDE | AHRS)
+"""Health as long as the estimator has no attitude and position yet: who waits for it waits for that."""
 
 
 @dataclass
@@ -155,11 +157,12 @@ def heartbeat(source: Source) -> Fields:
 
 def sys_status(source: Source) -> Fields:
     """SYS_STATUS: every sensor there and healthy; PREARM_CHECK, in health alone, says it may be armed."""
-    battery = source.vehicle.battery()
+    battery, autopilot = source.vehicle.battery(), source.vehicle.autopilot
+    health = HEALTHY if autopilot.healthy else STARTING
     return {
         "onboard_control_sensors_present": PRESENT,
         "onboard_control_sensors_enabled": PRESENT | RADIO,
-        "onboard_control_sensors_health": HEALTHY | (PREARM_CHECK if source.vehicle.autopilot.ready else 0),
+        "onboard_control_sensors_health": health | (PREARM_CHECK if autopilot.ready else 0),
         "load": _LOAD_PER_MILLE,
         "voltage_battery": uint16(battery.voltage_v * 1000.0),
         "current_battery": int16(battery.current_a * 100.0),

@@ -33,6 +33,7 @@ from scenarios.score import diverged, flight_metrics
 from scenarios.telemetry import Telemetry
 from sitl.control_settings import mix_of
 from sitl.errors import FroudeError, LinkError
+from sitl.param_corrections import companions
 from sitl.parameters import ParameterTable, ParameterType
 from sitl.profile import Profile
 from sitl.sampled_loop import RollGains
@@ -192,7 +193,7 @@ class _Flight:
         client.on_text = self._on_text
         client.connect()
         self._set_streams(client)
-        client.wait_ready(_READY_TIMEOUT_S)
+        client.make_ready(_READY_TIMEOUT_S)
         if client.state.armed:
             raise AlreadyArmed(client.link.name)
         pilot = Pilot(client, job.scenario, self._say(client), self._progress)
@@ -254,7 +255,8 @@ class _Flight:
 
     def _upload(self, client: Client) -> None:
         self._progress("upload")
-        self._backup = client.read_parameters(self._job.parameters)
+        touched = (*self._job.parameters, *companions(self._job.parameters))
+        self._backup = client.read_parameters(touched)
         if self._files is not None:
             self._files.parameters(_BACKUP, {name: value.value for name, value in self._backup.items()})
             self._files.parameters(".params", {name: value for name, (value, _) in self._job.parameters.items()})

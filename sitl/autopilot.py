@@ -5,6 +5,8 @@ At 100 Hz it thinks as PX4's commander does; every tick it lets `sitl.flight_con
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +23,8 @@ from sitl.sensors import Sensors
 from sitl.setpoints import AttitudeSetpoint, PositionRequest, PositionSetpoint
 
 COMMANDER_US = 10_000
+LONGEST_TEST_S = 3.0
+"""Longest time that a motor is tested for, s."""
 
 
 class Autopilot(Commander):
@@ -121,12 +125,16 @@ class Autopilot(Commander):
             self.control.take_position(self._now_us, request, fly=self.armed)
 
     def test_motor(self, motor: int, value: float, seconds: float) -> None:
-        """Turn one motor while disarmed: PX4's actuator test.
+        """Turn one motor while disarmed: PX4's actuator test. Nothing happens while armed or with a motor it has not.
 
         Args:
-            motor: from 0. value: 0..1, or below 0 for off. seconds: for how long.
+            motor: from 0. value: 0..1; below 0 or not finite is off. seconds: for how long, at most LONGEST_TEST_S.
         """
-        self._tested = (motor, max(0.0, min(1.0, value)), self._now_us + round(seconds * 1e6))
+        if self.armed or not 0 <= motor < self.motor_count:
+            return
+        value = max(0.0, min(1.0, value)) if math.isfinite(value) else 0.0
+        seconds = max(0.0, min(LONGEST_TEST_S, seconds)) if math.isfinite(seconds) else 0.0
+        self._tested = (motor, value, self._now_us + round(seconds * 1e6))
 
     # -- every tick --------------------------------------------------------------------------------------------
 

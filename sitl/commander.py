@@ -141,7 +141,9 @@ class Commander:
         """Switch the mode; disarmed every mode is accepted, armed only one that can run. explain: say a refusal."""
         if self.terminated:
             return self._refuse("Switching modes denied: flight terminated")
-        if self.armed and mode not in (self.intended, Mode.LAND):
+        if mode is Mode.TERMINATION:
+            return self._refuse("Switching to Termination is currently not available\t")
+        if self.armed:
             problem = self._mode_problem(mode, arming=False)
             if problem:
                 self.rejection = problem

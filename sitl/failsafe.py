@@ -63,6 +63,9 @@ _BY_OFFBOARD_LOSS = {
 }
 """Values of COM_OBL_RC_ACT."""
 
+STICKS_DISABLED = 4
+"""Value of COM_RC_IN_MODE with which nobody misses the sticks."""
+
 _NO_DELAY_S = 0.1
 _DELAYED = (Action.RTL, Action.LAND, Action.DESCEND)
 _EXCEPT_MISSION, _EXCEPT_HOLD, _EXCEPT_OFFBOARD = 1, 2, 4
@@ -101,7 +104,8 @@ class Failsafe:
     """Chooses between the user's mode and a failsafe's, for one vehicle.
 
     Args:
-        parameters: NAV_DLL_ACT, NAV_RCL_ACT, COM_OBL_RC_ACT, COM_RCL_EXCEPT, COM_DLL_EXCEPT, COM_FAIL_ACT_T.
+        parameters: NAV_DLL_ACT, NAV_RCL_ACT, COM_OBL_RC_ACT, COM_RCL_EXCEPT, COM_DLL_EXCEPT, COM_FAIL_ACT_T,
+            COM_RC_IN_MODE.
     """
 
     def __init__(self, parameters: ParameterTable) -> None:
@@ -132,7 +136,8 @@ class Failsafe:
         """
         if not links.manual_lost:
             self._manual_lost_at_arming = False
-        ignored = self._manual_lost_at_arming or self._excepted("COM_RCL_EXCEPT", intended)
+        unwanted = self._manual_lost_at_arming or int(self._parameters.get("COM_RC_IN_MODE")) == STICKS_DISABLED
+        ignored = unwanted or self._excepted("COM_RCL_EXCEPT", intended)
         self._watch("manual", links.manual_lost and not ignored, "NAV_RCL_ACT")
         self._watch("gcs", links.gcs_lost and not self._excepted("COM_DLL_EXCEPT", intended), "NAV_DLL_ACT")
         action = max(self._lasting.values(), default=Action.NONE)

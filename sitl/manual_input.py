@@ -1,6 +1,6 @@
 """Which sticks fly the vehicle: a joystick on one of its links or a radio, chosen by COM_RC_IN_MODE.
 
-The first source that speaks keeps the vehicle until it falls silent for COM_RC_LOSS_T.
+A source that flies the vehicle keeps it until it falls silent for COM_RC_LOSS_T, unless one that ranks higher speaks.
 Source: PX4 ``manual_control/ManualControlSelector.cpp``, ``ManualControl.cpp``.
 """
 
@@ -14,9 +14,9 @@ from sitl.setpoints import Sticks
 RADIO = -1
 """Source of sticks that came as radio channels; joysticks are numbered from 0 by link."""
 
-_RC_ONLY, _JOYSTICK_ONLY, _BOTH_FALLBACK, _BOTH_FIRST, _DISABLED = range(5)
-_RADIO_MODES = (_RC_ONLY, _BOTH_FALLBACK, _BOTH_FIRST)
-_JOYSTICK_MODES = (_JOYSTICK_ONLY, _BOTH_FALLBACK, _BOTH_FIRST)
+_RADIO_ONLY, _JOYSTICK_ONLY, _FALLBACK, _FIRST_EVER = range(4)
+_RANKED = {5: (RADIO, 0, 1), 6: (0, 1, RADIO), 7: (RADIO, 1, 0), 8: (1, 0, RADIO)}
+"""Values of COM_RC_IN_MODE that rank the sources, the first the highest."""
 _TAU_S = 0.5
 """How fast the place that a movement of the sticks is measured from follows them."""
 
@@ -35,6 +35,7 @@ class ManualInput:
     def __init__(self, parameters: ParameterTable) -> None:
         self._parameters = parameters
         self._source: int | None = None
+        self._first: int | None = None
         self._came_us = 0
         self._newest = Sticks()
         self._lag: list[float] | None = None
@@ -48,13 +49,16 @@ class ManualInput:
         Args:
             now_us: vehicle time. source: RADIO or the number of a joystick's link. sticks: each -1..1.
         """
-        mode = int(self._parameters.get("COM_RC_IN_MODE"))
-        allowed = _RADIO_MODES if source == RADIO else _JOYSTICK_MODES
-        if mode not in allowed or not all(math.isfinite(stick) for stick in sticks):
+        rank = self._rank(source)
+        if rank is None or not all(math.isfinite(stick) for stick in sticks):
             return False
         if self._source not in (None, source) and self._fresh(now_us):
-            return False
+            held = self._rank(self._source)
+            if held is not None and rank >= held:
+                return False
+            self._lag = None
         self._source = source
+        self._first = source if self._first is None else self._first
         self._came_us = now_us
         self._newest = Sticks(*(max(-1.0, min(1.0, stick)) for stick in sticks))
         self.sticks = self._newest
@@ -75,6 +79,16 @@ class ManualInput:
         limit = float(self._parameters.get("COM_RC_STICK_OV")) * 1e-2
         self.moving = any(abs(new - old) > limit for new, old in zip(self._newest, self._lag, strict=True))
         self._lag = [old + share * (new - old) for new, old in zip(self._newest, self._lag, strict=True)]
+
+    def _rank(self, source: int | None) -> int | None:
+        """Place of a source among those that COM_RC_IN_MODE allows, the highest 0; None if it does not."""
+        mode = int(self._parameters.get("COM_RC_IN_MODE"))
+        if mode in _RANKED:
+            order = _RANKED[mode]
+            return order.index(source) if source in order else None
+        first = mode == _FIRST_EVER and self._first in (None, source)
+        only = mode == (_RADIO_ONLY if source == RADIO else _JOYSTICK_ONLY)
+        return 0 if only or first or mode == _FALLBACK else None
 
     def _fresh(self, now_us: int) -> bool:
         return now_us - self._came_us <= float(self._parameters.get("COM_RC_LOSS_T")) * 1e6

@@ -8,6 +8,7 @@ Source: PX4 MulticopterPositionControl (parameters_update), MulticopterLandDetec
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Final
 
 from sitl.parameters import ParameterTable, from_raw, to_raw
@@ -29,6 +30,28 @@ _BELOW: Final = (
     ("MPC_Z_V_AUTO_DN", "MPC_Z_VEL_MAX_DN", "Descent speed has been constrained by max speed\t"),
 )
 """Parameter, the one it must not exceed, and what PX4 says when it does."""
+
+
+_FOLLOWS: Final = (
+    *((name, limit) for name, limit, _ in _BELOW),
+    ("MPC_THR_HOVER", "MPC_THR_MIN"),
+    ("MPC_THR_HOVER", "MPC_THR_MAX"),
+    ("LNDMC_Z_VEL_MAX", "MPC_LAND_SPEED"),
+    ("LNDMC_Z_VEL_MAX", "MPC_LAND_CRWL"),
+)
+"""Parameter that may be corrected, and the one whose change may bring that about."""
+
+
+def companions(names: Collection[str]) -> tuple[str, ...]:
+    """Return the parameters that a vehicle may correct when these are set: who puts these back puts those back, too.
+
+    Args:
+        names: of parameters. A name that a PX4 has not is no harm.
+    """
+    found: set[str] = set()
+    while more := {name for name, cause in _FOLLOWS if cause in found.union(names)} - found:
+        found |= more
+    return tuple(sorted(found - set(names)))
 
 
 def correct(table: ParameterTable) -> list[str]:

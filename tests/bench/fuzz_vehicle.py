@@ -29,7 +29,8 @@ from pathlib import Path
 TESTS = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(TESTS), str(TESTS.parent)]
 
-from hostile import KEY, Forge, Watched, capture_frames, captures, cut_up, damaged, mutate, weight  # noqa: E402
+from hostile import KEY, Forge, capture_frames, captures, cut_up, damaged, mutate  # noqa: E402
+from hostile_vehicle import Watched, weight  # noqa: E402
 
 from bridge.connection import Connection  # noqa: E402
 from bridge.fleet_status import FleetStatus, vehicle_status  # noqa: E402

@@ -16,9 +16,10 @@ from bridge.flight_log import MAX_TEXTS, FlightLog
 from bridge.log_store import find_logs
 from bridge.log_transfer import LogServer
 from sitl.modes import Severity
+from sitl.parameters import ParameterTable
 from sitl.profile import get_profile
 from sitl.setpoints import Sticks
-from sitl.vehicle import Vehicle
+from sitl.vehicle import Vehicle, airframe_parameters
 from sitl.vehicle_spec import resolve_vehicle
 
 UTC_US = 1_795_387_540_000_000
@@ -54,8 +55,10 @@ class Logged:
     """A vehicle with a log, from arming to disarming unless SDLOG_MODE says otherwise."""
 
     def __init__(self, directory, *, vehicle="ant-x", parameters=None, **options):
-        self.vehicle = Vehicle(resolve_vehicle(vehicle), get_profile("sitl"))
-        for name, value in ({"SDLOG_MODE": 0} | (parameters or {})).items():
+        model, profile = resolve_vehicle(vehicle), get_profile("sitl")
+        table = ParameterTable({**airframe_parameters(model, profile), "SDLOG_MODE": 0})
+        self.vehicle = Vehicle(model, profile, parameters=table)
+        for name, value in (parameters or {}).items():
             self.vehicle.parameters.set(name, value)
         self.said = []
         self.directory = directory

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from hostile import Forge, Watched, captures, weight
+from hostile import Forge, captures
+from hostile_vehicle import Watched, weight
 
 from bridge.connection import Connection, Message
 from bridge.events import EventServer
@@ -42,7 +43,7 @@ def parse(frame: bytes) -> list[Message]:
 
 
 def storm(service: Any, forge: Forge, *, messages: int = 3000, most: int = MOST_AT_ONCE) -> int:
-    """Messages the service takes, two in three of them taken from the captures; every answer must be one that can be sent.
+    """Messages the service takes, one in three of them recorded; every answer must be one that can be sent.
 
     Returns:
         how many answers came.

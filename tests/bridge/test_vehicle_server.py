@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -88,7 +89,7 @@ def test_default_rates_are_those_of_a_px4(flight: Any) -> None:
     both = flight("gcs", "onboard").hover()
     both.run(20.0)
     for ground, expected in zip(both.grounds, (GCS_HZ, API_HZ), strict=True):
-        heard = ground.counts()
+        heard = Counter(message.name for _, message in ground.heard if message.sysid == 1)
         heard.pop("STATUSTEXT", None)
         assert set(heard) == set(expected)
         for name, hz in expected.items():
@@ -123,7 +124,7 @@ class TestHeartbeat:
     def test_prearm_bit(self, flight: Any) -> None:
         one = flight()
         one.run(1.0)
-        assert not one.ground.named("SYS_STATUS")[-1].onboard_control_sensors_health & 0x10000000
+        assert one.ground.named("SYS_STATUS")[-1].onboard_control_sensors_health == 0x0300800F
         one.run(2.0)
         status = one.ground.named("SYS_STATUS")[-1]
         # as a PX4 in simulation: a radio is enabled though there is none, AHRS and attitude are only ever healthy
@@ -397,21 +398,35 @@ class TestServices:
                 per_tick[now_us] = per_tick.get(now_us, 0) + 1
         assert max(per_tick.values()) <= 20
 
-    @pytest.mark.parametrize("plan", [0, 1, 2])
-    def test_plans_are_empty_and_stay_so(self, on_ground: Any, plan: int) -> None:
+    @pytest.mark.parametrize(
+        ("plan", "command", "radius_m", "loads"), [(0, 16, 0, True), (1, 5003, 50, False), (2, 5100, 0, False)]
+    )
+    def test_plans_go_up_and_come_back(
+        self, on_ground: Any, plan: int, command: int, radius_m: float, loads: bool
+    ) -> None:
         target = {"target_system": 1, "target_component": 1, "mission_type": plan}
+        item = {**target, "seq": 0, "command": command, "x": 473977500, "y": 85456000, "z": 10.0, "autocontinue": 1}
+        item |= {"frame": 3, "param1": radius_m}
         (count,) = on_ground.ask("MISSION_REQUEST_LIST", **target)
         assert (count.name, count.count, count.mission_type) == ("MISSION_COUNT", 0, plan)
         assert (count.target_system, count.target_component) == (255, 190)
+        assert on_ground.ask("MISSION_ACK", **target) == []
+        (request,) = on_ground.ask("MISSION_COUNT", count=1, **target)
+        assert (request.name, request["seq"], request.mission_type) == ("MISSION_REQUEST_INT", 0, plan)
+        assert [one.type for one in on_ground.ask("MISSION_ITEM_INT", **item)] == [0]
+        assert bool(on_ground.autopilot.control.mission.items) is loads
+        (count,) = on_ground.ask("MISSION_REQUEST_LIST", **target)
+        assert count.count == 1
+        (back,) = on_ground.ask("MISSION_REQUEST_INT", **target)
+        assert (back.command, back.x, back.y, back.z, back.param1) == (command, 473977500, 85456000, 10.0, radius_m)
+        on_ground.ask("MISSION_ACK", **target)
         assert [one.type for one in on_ground.ask("MISSION_CLEAR_ALL", **target)] == [0]
-        assert [one.type for one in on_ground.ask("MISSION_COUNT", count=0, **target)] == [0]
-        assert [one.type for one in on_ground.ask("MISSION_COUNT", count=3, **target)] == [3]
-        assert [one.type for one in on_ground.ask("MISSION_ITEM_INT", **target)] == [1]
+        assert on_ground.autopilot.control.mission.items == ()
         assert on_ground.ask("MISSION_REQUEST_LIST", target_system=4, target_component=1) == []
 
     @pytest.mark.parametrize(
         ("opcode", "reply", "error"),
-        [(4, 129, 10), (3, 129, 10), (15, 129, 10), (14, 129, 10), (1, 129, 4), (2, 128, None), (77, 129, 7)],
+        [(4, 129, 10), (3, 129, 10), (15, 129, 4), (14, 129, 10), (1, 129, 4), (2, 128, None), (77, 129, 7)],
     )
     def test_files_are_not_found(self, on_ground: Any, opcode: int, reply: int, error: int | None) -> None:
         request = struct.pack("<HBBBBBBI", 65535, 0, opcode, 6, 0, 0, 0, 0) + b"@PARAM"
@@ -423,9 +438,9 @@ class TestServices:
         assert (seq, code, asked) == (0, reply, opcode)
         assert answer.payload[12 : 12 + size] == (b"" if error is None else bytes([error]))
 
-    def test_there_are_no_logs(self, on_ground: Any) -> None:
-        (entry,) = on_ground.ask("LOG_REQUEST_LIST", target_system=1, target_component=1, end=65535)
-        assert (entry.name, entry.num_logs) == ("LOG_ENTRY", 0)
+    def test_without_logs_there_is_silence(self, on_ground: Any) -> None:
+        assert on_ground.ask("LOG_REQUEST_LIST", target_system=1, target_component=1, end=65535) == []
+        assert on_ground.ask("LOG_REQUEST_DATA", target_system=1, target_component=1, count=90) == []
 
     @pytest.mark.parametrize(
         "name",

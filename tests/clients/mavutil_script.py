@@ -14,11 +14,11 @@ os.environ["MAVLINK20"] = "1"
 INT32, REAL32 = 6, 9
 
 
-def open_station(port: int, *, system: int = 255) -> Any:
+def open_station(port: int, *, system: int = 255, component: int = 0) -> Any:
     """A mavutil connection that waits for a vehicle on a port."""
     from pymavlink import mavutil
 
-    return mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=system)
+    return mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=system, source_component=component)
 
 
 class Script:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +23,7 @@ pytestmark = pytest.mark.client
 from mavsdk.asyncio.plugins.ftp import FtpAsync  # noqa: E402
 from mavsdk.asyncio.plugins.log_files import LogFilesAsync  # noqa: E402
 from mavsdk.asyncio.plugins.mission_raw import MissionRawAsync  # noqa: E402
-from mavsdk.plugins.mission_raw.mission_raw import MissionItem  # noqa: E402
+from mavsdk.plugins.mission_raw.mission_raw import MissionItem, MissionRawError  # noqa: E402
 
 
 @dataclass
@@ -62,7 +63,11 @@ def test_mavsdk_parameters_and_missions(network: BadNetwork) -> None:
             for number in range(12)
         ]
         mission = MissionRawAsync(craft.system)
-        await mission.upload_mission(items)
+        for _ in range(5):
+            # The last acknowledgement is the one message that nobody repeats.
+            with suppress(MissionRawError):
+                await mission.upload_mission(items)
+                break
         assert [one.z for one in await mission.download_mission()] == [one.z for one in items]
 
         await craft.ready()
@@ -77,20 +82,17 @@ def test_mavsdk_parameters_and_missions(network: BadNetwork) -> None:
 
 def test_mavsdk_files_and_logs(network: BadNetwork, tmp_path: Path) -> None:
     async def script(craft: Craft) -> None:
-        # The log from the start on ends here: MAVSDK asks for what was lost piece by piece.
+        # The log that began with the vehicle ends here, short.
         await craft.param.set_param_int("SDLOG_MODE", -1)
         ftp, logs = FtpAsync(craft.system), LogFilesAsync(craft.system)
-        name = next(
-            entry.name
-            for entry in (await ftp.list_directory("/etc/extras")).entries
-            if entry.name.startswith("parameters")
-        )
-        for burst in (False, True):
-            folder = tmp_path / f"burst-{burst}"
-            folder.mkdir()
-            async for _ in ftp.download(f"/etc/extras/{name}", str(folder), burst):
+        names = [entry.name for entry in (await ftp.list_directory("/etc/extras")).entries]
+        for kind, burst in (("component_general", False), ("parameters", True)):
+            name = next(one for one in names if one.startswith(kind))
+            async for _ in ftp.download(f"/etc/extras/{name}", str(tmp_path), burst):
                 pass
-            assert await ftp.are_files_identical(str(folder / name), f"/etc/extras/{name}")
+            assert await ftp.are_files_identical(str(tmp_path / name), f"/etc/extras/{name}")
+        # MAVSDK asks for every 90 bytes that are missing by themselves, and waits half a second for each.
+        network.relay.loss = 0.02
         entries = await logs.get_entries()
         assert len(entries) == 1
         async for _ in logs.download_log_file(entries[0], str(tmp_path / "flight.ulg")):

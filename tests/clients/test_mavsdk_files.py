@@ -96,7 +96,8 @@ def test_a_flight_log_for_pyulog(vehicle: VehicleProcess, tmp_path: Path) -> Non
     fly(vehicle.port, script, 90)
     log = pyulog.ULog(str(path))
     assert not log.file_corruption
-    assert log.initial_parameters["MC_ROLL_P"] == pytest.approx(6.25)
+    assert log.initial_parameters["MC_ROLL_P"] == pytest.approx(parameter_specs()["MC_ROLL_P"].default)
+    assert 6.25 in [value for _, name, value in log.changed_parameters if name == "MC_ROLL_P"]
     height = -log.get_dataset("vehicle_local_position").data["z"]
     assert height.max() == pytest.approx(3.0, abs=0.6)
     assert {one.name for one in log.data_list} >= {

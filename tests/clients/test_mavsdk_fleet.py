@@ -14,6 +14,8 @@ from vehicle_process import VehicleProcess, free_port
 
 pytestmark = pytest.mark.client
 
+ONBOARD_COMPUTER = 191
+
 from mavsdk.asyncio.plugins.mavlink_direct import MavlinkDirectAsync  # noqa: E402
 from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkMessage  # noqa: E402
 
@@ -42,10 +44,12 @@ def test_two_vehicles_and_a_mavsdk_for_each(sitl: Callable[..., VehicleProcess])
 def test_stations_on_two_links_hear_each_other(sitl: Callable[..., VehicleProcess]) -> None:
     other = free_port()
     vehicle = sitl("--link", f"udpout://127.0.0.1:{other}#gcs")
-    station = open_station(other, system=77)
+    station = open_station(other, system=77, component=ONBOARD_COMPUTER)
 
     async def script() -> None:
         async with connected(vehicle.port) as craft:
+            # It has nobody to speak to before the vehicle has spoken.
+            assert await asyncio.to_thread(station.wait_heartbeat, timeout=10) is not None
             other = await _system(craft.sdk, station, 77)
             direct = MavlinkDirectAsync(other)
             heard = asyncio.ensure_future(until(direct.subscribe_message("STATUSTEXT"), lambda _: True, 15.0))
@@ -75,7 +79,7 @@ def _ping(system: int) -> MavlinkMessage:
 async def _system(sdk: Any, station: Any, number: int) -> Any:
     """A system that MAVSDK hears, once it has seen its heartbeats."""
     for _ in range(100):
-        station.mav.heartbeat_send(6, 8, 0, 0, 4)
+        station.mav.heartbeat_send(18, 8, 0, 0, 4)
         await asyncio.sleep(0.1)
         for system in await sdk.get_systems():
             if await system.get_system_id() == number:

@@ -78,7 +78,7 @@ def test_a_mission_comes_back_as_it_went_up(vehicle: VehicleProcess) -> None:
         assert (await mission.download_mission()).mission_items == []
         with pytest.raises(MissionError) as refused:
             await mission.upload_mission(MissionPlan([]))
-        assert refused.value.result == MissionResult.INVALID_ARGUMENT
+        assert refused.value.result == MissionResult.NO_MISSION_AVAILABLE
 
     fly(vehicle.port, script)
 
@@ -165,6 +165,10 @@ def test_a_mission_from_take_off_to_landing(vehicle: VehicleProcess) -> None:
         await until(craft.telemetry.subscribe_position(), lambda one: one.relative_altitude_m > 4.0)
         await craft.disarmed()
         await mission.clear_mission()
+        # In Mission without a mission it is not ready to arm.
+        await until(craft.telemetry.subscribe_health(), lambda one: not one.is_armable)
+        await craft.action.hold()
+        await craft.ready()
 
     fly(vehicle.port, script, 90)
 

@@ -43,10 +43,10 @@ def test_all_parameters(script: Script) -> None:
     end = time.monotonic() + 20
     specs = parameter_specs()
     while len(seen) < len(specs) and time.monotonic() < end:
-        message = c.recv_match(type="PARAM_VALUE", blocking=True, timeout=1)
+        message = c.recv_match(type="PARAM_VALUE", blocking=True, timeout=0.3)
         if message is None:
             # A full socket buffer loses some on a busy computer; a script asks for those again.
-            for index in list(set(range(len(specs))) - {one.param_index for one in seen.values()})[:10]:
+            for index in list(set(range(len(specs))) - {one.param_index for one in seen.values()})[:50]:
                 c.mav.param_request_read_send(1, 1, b"", index)
         elif message.param_index != 65535:
             seen[message.param_id] = message
@@ -145,6 +145,7 @@ def test_a_mission_item_by_item(script: Script) -> None:
     for mission_type in (1, 2):
         c.mav.mission_request_list_send(1, 1, mission_type)
         assert script.until(lambda m, kind=mission_type: m.mission_type == kind, "MISSION_COUNT").count == 0
+        c.mav.mission_ack_send(1, 1, 0, mission_type)
     c.mav.mission_clear_all_send(1, 1)
     assert script.until(lambda _: True, "MISSION_ACK").type == 0
 

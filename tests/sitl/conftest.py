@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -17,7 +18,7 @@ from sitl.plant import Plant
 from sitl.profile import get_profile
 from sitl.rotation import to_euler
 from sitl.sensors import Sensors, geodetic
-from sitl.setpoints import PositionRequest
+from sitl.setpoints import PositionRequest, Sticks
 from sitl.vehicle import airframe_parameters
 from sitl.vehicle_spec import resolve_vehicle
 
@@ -181,3 +182,67 @@ class Flown:
 def flown() -> type[Flown]:
     """The class to fly one of."""
     return Flown
+
+
+@pytest.fixture
+def ground(flight: Any) -> Any:
+    """A whole vehicle on the ground, ready to arm."""
+    made = flight()
+    made.get_ready()
+    assert [text for _, text in made.texts] == ["Preflight Fail: heading estimate invalid"]
+    made.texts.clear()
+    return made
+
+
+@pytest.fixture
+def hover(flight: Any) -> Any:
+    """A whole vehicle in Hold at 10 m."""
+    made = flight()
+    made.take_off(10.0, settle_s=3.0)
+    made.texts.clear()
+    return made
+
+
+@pytest.fixture
+def offboard(flight: Any) -> Any:
+    """A whole vehicle in Offboard at 10 m, with level set-points at 50 Hz while it runs with ``keep``."""
+    made = flight()
+    made.take_off(10.0, settle_s=2.0)
+    made.go_offboard()
+    made.keep = lambda k: made.autopilot.offboard_attitude((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, math.nan), 0.5)
+    made.run(1.0, made.keep)
+    made.texts.clear()
+    return made
+
+
+class Pilot:
+    """Sticks on a joystick's link, sent at 20 Hz of vehicle time."""
+
+    def __init__(self, flight: Any, source: int = 0) -> None:
+        self.flight = flight
+        self.source = source
+
+    def send(self, sticks: Sticks) -> bool:
+        """Once."""
+        taken: bool = self.flight.autopilot.manual.take(self.flight.vehicle.time_us, self.source, sticks)
+        return taken
+
+    def fly(self, seconds: float, **sticks: float) -> None:
+        """Hold the sticks somewhere."""
+        every = max(1, 50_000 // self.flight.vehicle.tick_us)
+        self.flight.run(seconds, lambda k: self.send(Sticks(**sticks)) if k % every == 0 else None)
+
+    def fly_until(self, condition: Callable[[], bool], timeout_s: float, **sticks: float) -> float:
+        """Hold the sticks somewhere until something holds, looked at every 100 ms; s it took."""
+        start = self.flight.time_s
+        while not condition():
+            assert self.flight.time_s - start < timeout_s, f"not within {timeout_s} s; said {self.flight.texts}"
+            self.fly(0.1, **sticks)
+        took: float = self.flight.time_s - start
+        return took
+
+
+@pytest.fixture
+def pilot() -> type[Pilot]:
+    """The class to fly a whole vehicle by sticks with."""
+    return Pilot

@@ -7,105 +7,10 @@ import numpy as np
 import pytest
 
 from sitl.modes import EXTERNAL_MODES, MODE_NAMES, STICK_MODES, LandedState, Mode, Result
-from sitl.parameters import ParameterTable
 from sitl.rotation import from_euler
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 STILL = (0.0, 0.0, 0.0)
-DENIED = "Arming denied: Resolve system health failures first\t"
-
-
-@pytest.fixture
-def ground(flight: Any) -> Any:
-    """A vehicle on the ground, ready to arm."""
-    made = flight()
-    made.get_ready()
-    assert [text for _, text in made.texts] == ["Preflight Fail: heading estimate invalid"]
-    made.texts.clear()
-    return made
-
-
-@pytest.fixture
-def hover(flight: Any) -> Any:
-    """A vehicle in Hold at 10 m."""
-    made = flight()
-    made.take_off(10.0, settle_s=3.0)
-    made.texts.clear()
-    return made
-
-
-class TestArming:
-    def test_is_refused_until_the_estimator_is_ready(self, flight: Any) -> None:
-        early = flight()
-        early.run(1.0)
-        assert early.autopilot.command_arm(True) is Result.TEMPORARILY_REJECTED
-        early.listen()
-        assert [text for _, text in early.texts] == ["Preflight Fail: heading estimate invalid", DENIED]
-        assert early.autopilot.rejection == "heading estimate invalid"
-        early.get_ready()
-        assert early.time_s == pytest.approx(2.0, abs=0.03)
-        assert early.autopilot.command_arm(True) is Result.ACCEPTED
-
-    def test_says_so_and_sets_home(self, ground: Any) -> None:
-        before = ground.autopilot.home
-        ground.run(1.0)
-        ground.arm()
-        assert ground.said("Armed by external command\t")
-        home = ground.autopilot.home
-        assert home is not before
-        assert (home.lat_deg, home.lon_deg, home.alt_m) == pytest.approx((47.397742, 8.545594, 488.0), abs=1e-6)
-        assert home.position_ned == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
-
-    def test_again_is_accepted_without_a_word(self, ground: Any) -> None:
-        ground.arm()
-        ground.texts.clear()
-        assert ground.autopilot.command_arm(True, force=True) is Result.ACCEPTED
-        ground.listen()
-        assert ground.texts == []
-
-    def test_disarming_on_the_ground(self, ground: Any) -> None:
-        ground.arm()
-        ground.run(0.5)
-        assert ground.autopilot.command_arm(False) is Result.ACCEPTED
-        ground.run(0.1)
-        assert ground.said("Disarmed by external command\t")
-        assert ground.autopilot.motors == (0.0, 0.0, 0.0, 0.0)
-
-    def test_disarming_the_disarmed_is_accepted_without_a_word(self, ground: Any) -> None:
-        assert ground.autopilot.command_arm(False) is Result.ACCEPTED
-        ground.listen()
-        assert ground.texts == []
-
-    def test_force_does_not_skip_the_checks(self, flight: Any) -> None:
-        assert flight().autopilot.command_arm(True, force=True) is Result.TEMPORARILY_REJECTED
-
-    def test_is_refused_in_land_mode_with_the_bare_text(self, ground: Any) -> None:
-        ground.autopilot.command_mode(Mode.LAND)
-        assert ground.autopilot.command_arm(True) is Result.TEMPORARILY_REJECTED
-        ground.listen()
-        assert [text for _, text in ground.texts] == [DENIED]
-        assert "Land" in ground.autopilot.rejection
-
-    def test_is_refused_in_offboard_without_a_signal_and_not_with_one(self, ground: Any) -> None:
-        assert ground.autopilot.command_mode(Mode.OFFBOARD) is Result.ACCEPTED
-        assert ground.autopilot.command_arm(True) is Result.TEMPORARILY_REJECTED
-        assert ground.autopilot.rejection == "no offboard signal"
-        ground.autopilot.offboard_attitude(None, STILL, 0.0)
-        assert ground.autopilot.command_arm(True) is Result.ACCEPTED
-
-    @pytest.mark.parametrize(
-        ("name", "value"), [("CA_ROTOR_COUNT", 0), ("CA_ROTOR2_PX", math.nan), ("CA_ROTOR0_KM", math.inf)]
-    )
-    def test_is_refused_without_a_usable_geometry(self, ground: Any, name: str, value: float) -> None:
-        ground.parameters.set(name, value)
-        ground.run(0.1)
-        assert ground.autopilot.command_arm(True) is Result.TEMPORARILY_REJECTED
-        assert "CA_ROTOR" in ground.autopilot.rejection
-
-    def test_a_table_without_an_airframe_cannot_arm(self, flight: Any) -> None:
-        bare = flight(parameters=ParameterTable())
-        bare.get_ready()
-        assert bare.autopilot.command_arm(True) is Result.TEMPORARILY_REJECTED
 
 
 class TestNothingTurnsWhileDisarmed:
@@ -133,33 +38,6 @@ class TestNothingTurnsWhileDisarmed:
         ground.arm()
         ground.run(0.5)
         assert ground.autopilot.motors == pytest.approx((0.0,) * 4, abs=1e-6)
-
-
-class TestAutoDisarm:
-    @pytest.mark.parametrize(("wait_s", "after_s"), [(10.0, 11.0), (3.0, 4.0)])
-    def test_comes_a_second_after_com_disarm_prflt(self, ground: Any, wait_s: float, after_s: float) -> None:
-        ground.parameters.set("COM_DISARM_PRFLT", wait_s)
-        armed_s = ground.arm()
-        ground.run(after_s + 0.5)
-        (said_s,) = ground.said("Disarmed by auto preflight disarming\t")
-        assert said_s - armed_s == pytest.approx(after_s, abs=0.02)
-        assert not ground.autopilot.armed
-        assert ground.autopilot.mode is Mode.LOITER
-
-    def test_can_be_turned_off(self, ground: Any) -> None:
-        ground.parameters.set("COM_DISARM_PRFLT", -1.0)
-        ground.arm()
-        ground.run(15.0)
-        assert ground.autopilot.armed
-
-    def test_take_off_to_where_it_already_is_never_leaves_the_ground(self, ground: Any) -> None:
-        # what happens to scripts that send a height above ground where PX4 wants one above the sea
-        ground.arm()
-        assert ground.autopilot.command_takeoff(10.0) is Result.ACCEPTED
-        ground.run(11.5)
-        assert ground.said("Already higher than takeoff altitude\t")
-        assert ground.said("Disarmed by auto preflight disarming\t")
-        assert not ground.said("Takeoff detected\t")
 
 
 class TestTakeOff:
@@ -285,7 +163,9 @@ class TestHoldAndLand:
         hover.parameters.set("COM_DISARM_LAND", 0.5)
         hover.autopilot.command_land()
         hover.run_until(lambda: not hover.autopilot.armed, 40.0)
-        assert hover.said("Disarmed by landing\t")[0] - hover.said("Landing detected\t")[0] == pytest.approx(0.5, abs=0.03)
+        assert hover.said("Disarmed by landing\t")[0] - hover.said("Landing detected\t")[0] == pytest.approx(
+            0.5, abs=0.03
+        )
 
     def test_hold_after_landing_stays_down(self, hover: Any) -> None:
         hover.autopilot.command_land()
@@ -330,9 +210,7 @@ class TestInTheAir:
     def test_modes_that_cannot_run_are_refused_by_name(self, hover: Any, mode: Mode) -> None:
         assert hover.autopilot.command_mode(mode) is Result.TEMPORARILY_REJECTED
         hover.listen()
-        assert [text for _, text in hover.texts] == [
-            f"Switching to {MODE_NAMES[mode]} is currently not available\t"
-        ]
+        assert [text for _, text in hover.texts] == [f"Switching to {MODE_NAMES[mode]} is currently not available\t"]
         assert hover.autopilot.mode is hover.autopilot.intended is Mode.LOITER
 
     def test_every_other_mode_is_flown_from_the_next_tick_on(self, hover: Any) -> None:

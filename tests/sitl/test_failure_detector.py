@@ -73,18 +73,6 @@ class TestTilt:
         assert detector.action(round(armed_s * 1e6)) is action
 
 
-@pytest.fixture
-def offboard(flight: Any) -> Any:
-    """A vehicle in Offboard at 10 m, with level set-points at 50 Hz while it runs with ``keep``."""
-    made = flight()
-    made.take_off(10.0, settle_s=2.0)
-    made.go_offboard()
-    made.keep = lambda k: made.autopilot.offboard_attitude((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, math.nan), 0.5)
-    made.run(1.0, made.keep)
-    made.texts.clear()
-    return made
-
-
 class TestAttitudeFailure:
     def tip(self, made: Any, seconds: float) -> None:
         """Fly on the side: 75 degrees of roll, with thrust to spare."""
