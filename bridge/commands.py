@@ -119,7 +119,8 @@ class Commands:
 
     def handle_set_mode(self, link: ServerLink, msg: Any) -> None:
         """Carry out a SET_MODE message as the DO_SET_MODE it became."""
-        if msg.target_system not in (0, self._server.sysid):
+        server = self._server
+        if msg.target_system not in (0, server.sysid) or (msg.sysid, msg.compid) == (server.sysid, server.compid):
             return
         main, sub = split_custom_mode(msg.custom_mode)
         params = (float(msg.base_mode), float(main), float(sub), 0.0, 0.0, 0.0, 0.0)

@@ -124,6 +124,7 @@ def _json(content: Mapping[str, Any]) -> bytes:
     return json.dumps(content, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
 
 
+@functools.lru_cache(maxsize=8)  # vehicles of one kind have the same files
 def _compress(data: bytes) -> bytes:
     """Return an .xz file that small decoders can read: one block, CRC-32, a dictionary of 1 MiB."""
     import lzma

@@ -71,6 +71,13 @@ def serve_parameters(files: FileTree, table: ParameterTable, *, defaults: bool =
             parameter for a float (mavproxy_param.py, ftp_callback), so that its `param set` of an INT32 is
             refused for its type; told that there is none it asks for the list, which has the types.
     """
-    files.add(PATH, lambda: pack_parameters(table), listed=False)
+    made: dict[bool, tuple[int, bytes]] = {}
+
+    def packed(with_defaults: bool) -> bytes:
+        if made.get(with_defaults, (-1, b""))[0] != table.revision:
+            made[with_defaults] = (table.revision, pack_parameters(table, defaults=with_defaults))
+        return made[with_defaults][1]
+
+    files.add(PATH, lambda: packed(False), listed=False)
     if defaults:
-        files.add(f"{PATH}?withdefaults=1", lambda: pack_parameters(table, defaults=True), listed=False)
+        files.add(f"{PATH}?withdefaults=1", lambda: packed(True), listed=False)

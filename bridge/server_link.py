@@ -34,6 +34,7 @@ class ServerLink:
     Attributes:
         schedule: when each message is due here.
         peers: (sysid, compid) of everybody heard here.
+        heard_us: vehicle time of the last bytes.
         gcs_seen_us: vehicle time of a ground station's last HEARTBEAT, None before the first.
     """
 
@@ -45,6 +46,7 @@ class ServerLink:
         self.schedule = Schedule(mode)
         self.peers: set[tuple[int, int]] = set()
         self.gcs_seen_us: int | None = None
+        self.heard_us = 0
         self.resting_until_us = 0
         self.texts: deque[tuple[int, Severity, str]] = deque(maxlen=_TEXTS_KEPT)
         self._text_id = 0

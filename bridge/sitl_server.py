@@ -226,4 +226,6 @@ def serve(
 def _server(vehicle: Vehicle, links: Sequence[ServerLink], files: VehicleFiles | None = None) -> VehicleServer:
     if links and vehicle.parameters.get("MAV_SYS_ID") != links[0].connection.sysid:
         vehicle.parameters.set("MAV_SYS_ID", links[0].connection.sysid)
-    return VehicleServer(vehicle, links, utc_boot_us=utc_us() - vehicle.time_us, files=files or VehicleFiles())
+    server = VehicleServer(vehicle, links, utc_boot_us=utc_us() - vehicle.time_us, files=files or VehicleFiles())
+    server.services.metadata.files()  # takes a tenth of a second, which no tick has
+    return server

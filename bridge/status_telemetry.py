@@ -81,7 +81,9 @@ def position_target_global_int(source: Source) -> Fields | None:
     vehicle = source.vehicle
     autopilot = vehicle.autopilot
     position_sp = autopilot.position_sp
-    if autopilot.landed_state is LandedState.ON_GROUND or not all(map(math.isfinite, position_sp.position_ned)):
+    if autopilot.landed_state is LandedState.ON_GROUND or not autopilot.by_position:
+        return None
+    if not all(map(math.isfinite, position_sp.position_ned)):
         return None
     lat, lon, altitude_m = geodetic(position_sp.position_ned, vehicle.origin)
     vx, vy, vz = position_sp.velocity_ned

@@ -11,7 +11,7 @@ from bridge.errors import LinkClosed, PeerLost, PeerSilent
 from bridge.link import Link
 from bridge.udp_link import bind, resolve
 
-_CHUNK = 65_536
+_CHUNK = 8_192
 _STUCK_S = 1.0
 _RETRY_US = 50_000
 

@@ -11,7 +11,9 @@ from typing import Any
 from bridge.errors import LinkClosed, LinkUrlError, PortBusy
 from bridge.link import Link
 
-_LARGEST = 65_535
+_LARGEST = 16_384
+"""Longest datagram that is read whole, bytes; nobody packs so many messages into one."""
+
 _STRANGERS_AT_ONCE = 64
 
 # (host, port) or, for IPv6, (host, port, flow, scope): the socket module's own shape.
@@ -124,7 +126,8 @@ class UdpLink(Link):
             except OSError as error:
                 self._count(error)
                 return None
-            if sender in self._peers or (self._open_port and self._admits(sender)):
+            # nobody can answer port 0: it is forged
+            if sender[1] and (sender in self._peers or (self._open_port and self._admits(sender))):
                 return data
             self.strangers += 1
         return None
@@ -172,6 +175,8 @@ _NOBODY_THERE = {
     errno.EAGAIN,
     errno.ENOBUFS,
     errno.EPERM,  # a firewall's answer to sendto
+    errno.EACCES,
+    errno.EINVAL,  # an address that nobody can have
     errno.EADDRNOTAVAIL,  # an interface that has gone, or one from which the loopback cannot be reached
 }
 

@@ -33,6 +33,12 @@ _MAV_TYPE_GCS = 6
 _HOUSEKEEPING_US = 4_000
 _REPEAT_US = 1_000_000
 _DATAGRAMS_PER_TICK = 64
+_BYTES_PER_TICK = 16_384
+_QUIET_US = 100_000
+"""A stream that is silent for so long does not go on with the frame it has begun."""
+_PEERS_KEPT = 128
+_TEXTS_AT_ONCE, _TEXT_EVERY_US = 50, 50_000
+"""Texts that may be said at once, and how long it takes until there may be one more: nobody can flood a link."""
 _LOST_PEER_PAUSE_US = 100_000
 
 
@@ -73,6 +79,7 @@ class VehicleServer:
         self.refusals = 0
         self.shutdown_asked = False
         self._said_us: dict[str, int] = {}
+        self._text_room, self._text_us = _TEXTS_AT_ONCE * _TEXT_EVERY_US, 0
         self._acknowledged: list[tuple[int, Result, int, int]] = []
         self._log: FlightLog | None = None
         self.services = Services(
@@ -135,6 +142,8 @@ class VehicleServer:
     def speak(self) -> None:
         """Send the telemetry, texts and parameters that are due on every link."""
         now_us = self.vehicle.time_us
+        while self._acknowledged:
+            self._acknowledge(*self._acknowledged.pop(0))
         for link in self.links:
             if now_us >= link.resting_until_us:
                 self.source.link = link
@@ -156,12 +165,16 @@ class VehicleServer:
                 try:
                     data = link.link.recv()
                     if data is not None:
+                        link.heard_us = now_us
                         self._receive(link, data)
                         self._housekeeping_us = now_us
+                    elif link.connection.pending and now_us - link.heard_us >= _QUIET_US:
+                        for msg in link.connection.flush():
+                            self._handle(link, msg)
                 except (PeerLost, LinkClosed):
                     self._peer_lost(link)
-        while self._acknowledged:
-            self._acknowledge(*self._acknowledged.pop(0))
+                except Exception as error:
+                    self._defect("link", error)
 
     def close(self) -> None:
         """End what is being written; the links stay open. Raises FileError as `Services.close`."""
@@ -173,6 +186,11 @@ class VehicleServer:
         A text that ends with a TAB is one that ground stations with events drop; if it is none of ours it keeps no TAB.
         """
         now_us = self.vehicle.time_us
+        self._text_room = min(_TEXTS_AT_ONCE * _TEXT_EVERY_US, self._text_room + now_us - self._text_us)
+        self._text_us = now_us
+        if self._text_room < _TEXT_EVERY_US:
+            return
+        self._text_room -= _TEXT_EVERY_US
         if self._log is not None:
             self._log.text(int(severity), text.rstrip("\t"))
         if text.endswith("\t") and not self.services.events.report(severity, text[:-1], now_us):
@@ -219,18 +237,26 @@ class VehicleServer:
 
     def _receive(self, link: ServerLink, data: bytes | None) -> None:
         """Handle what came in on a link; a flood is left for the next ticks."""
+        room = _BYTES_PER_TICK
         for _ in range(_DATAGRAMS_PER_TICK):
             if data is None:
                 return
             for msg in link.connection.receive(data):
                 self._handle(link, msg)
+            room -= len(data)
+            if room <= 0:
+                return
             data = link.link.recv()
         if data is not None:
             for msg in link.connection.receive(data):
                 self._handle(link, msg)
 
     def _handle(self, link: ServerLink, msg: Message) -> None:
-        link.peers.add((msg.sysid, msg.compid))
+        sender = (msg.sysid, msg.compid)
+        if sender not in link.peers:
+            if len(link.peers) >= _PEERS_KEPT:
+                link.peers.pop()
+            link.peers.add(sender)
         if self._forwards:
             self.forwarder.route(link, msg, self.vehicle.time_us)
         handler = self._handlers.get(msg.name)
@@ -280,6 +306,8 @@ class VehicleServer:
                         link.send(name, fields)
             except (PeerLost, LinkClosed):
                 self._peer_lost(link)
+            except Exception as error:
+                self._defect("housekeeping", error)
 
     def _peer_lost(self, link: Any) -> None:
         """Forget who was there; a listening link may get another peer, so try again a little later."""

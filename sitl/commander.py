@@ -14,17 +14,7 @@ from sitl.ground_contact import GroundContact
 from sitl.land_detector import LandDetector, Motion
 from sitl.landing_watch import LandingWatch, land_limits
 from sitl.manual_input import ManualInput
-from sitl.modes import (
-    EXTERNAL_MODES,
-    MODE_NAMES,
-    NEVER_ARM,
-    STICK_MODES,
-    Home,
-    Mode,
-    Result,
-    Severity,
-    Text,
-)
+from sitl.modes import EXTERNAL_MODES, MODE_NAMES, NEVER_ARM, STICK_MODES, Home, Mode, Result, Severity, Text
 from sitl.parameters import ParameterTable
 from sitl.plant import Plant
 from sitl.preflight import health_problem, mode_problem, stick_problem
@@ -163,7 +153,9 @@ class Commander:
         return Result.ACCEPTED
 
     def command_land(self) -> Result:
-        """Land here; always accepted."""
+        """Land here; accepted unless the flight was terminated."""
+        if self.terminated:
+            return self._refuse("Landing denied: flight terminated")
         self.say(Severity.INFO, "Landing at current position\t")
         self._choose(Mode.LAND)
         return Result.ACCEPTED
@@ -217,7 +209,7 @@ class Commander:
         return Result.ACCEPTED
 
     def command_terminate(self, on: bool) -> Result:
-        """Stop all motors for good (until disarmed); denied while disarmed or when off is asked."""
+        """Stop all motors until disarmed, also by landing; denied while disarmed or when off is asked."""
         if not on or not self.armed:
             return Result.DENIED
         self._terminate()
@@ -389,7 +381,9 @@ class Commander:
     def _terminate(self) -> None:
         self.terminated = True
         self.failsafe = True
-        self.mode = self.intended = Mode.TERMINATION
+        self.intended = Mode.TERMINATION
+        # so that nothing flown before asks for a next mode, and landing is judged without a climb rate
+        self._begin(Mode.TERMINATION, self.mode)
         self.control.stop()
 
     def _set_home(self) -> None:

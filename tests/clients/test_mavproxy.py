@@ -110,16 +110,20 @@ def test_a_flight(mavproxy: Console) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_the_log_of_that_flight(logs: Path, sitl: Callable[..., VehicleProcess], tmp_path: Path) -> None:
+def test_the_log_of_that_flight(
+    mavproxy: Console, logs: Path, sitl: Callable[..., VehicleProcess], tmp_path: Path
+) -> None:
     pyulog = pytest.importorskip("pyulog")
+    time.sleep(1.0)  # the log goes on for a second after the flight
+    mavproxy.say("log list")
+    size = int(mavproxy.until(r"Log 1  numLogs 2 lastLog \d+ size (\d+) ")[1])
     # At its own pace: MAVProxy never finishes a download whose end came before what it missed.
     slow = sitl("--log-dir", str(logs), mode="gcs")
     path = tmp_path / "flight.ulg"
     with Console(slow.port, tmp_path) as reader:
         reader.parameters()
         reader.say("log list")
-        size = int(reader.until(r"Log 1  numLogs 3 lastLog \d+ size (\d+) ")[1])
-        downloaded(reader, 1, path)
+        downloaded(reader, int(reader.until(rf"Log (\d+)  numLogs 3 lastLog \d+ size {size} ")[1]), path)
     slow.stop()
     assert path.stat().st_size == size
     log = pyulog.ULog(str(path))
