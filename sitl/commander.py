@@ -205,6 +205,7 @@ class Commander:
             return Result.DENIED
         w, x, y, z = self._plant.quat.tolist()
         self.home = Home(lat_deg, lon_deg, alt_m, local_position(lat_deg, lon_deg, alt_m), (w, x, y, z))
+        self.control.mission.home = self.home
         self._home_here = False
         return Result.ACCEPTED
 
@@ -390,3 +391,4 @@ class Commander:
         position = self._plant.position_ned()
         w, x, y, z = self._plant.quat.tolist()
         self.home = Home(*geodetic(position), position, (w, x, y, z))
+        self.control.mission.home = self.home

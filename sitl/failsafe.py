@@ -174,6 +174,7 @@ class Failsafe:
         bit = {
             Mode.MISSION: _EXCEPT_MISSION,
             Mode.LOITER: _EXCEPT_HOLD,
+            Mode.TAKEOFF: _EXCEPT_HOLD,
             Mode.OFFBOARD: _EXCEPT_OFFBOARD,
         }.get(FLOWN_AS.get(intended, intended), 0)
         return bool(bits & bit)

@@ -8,8 +8,10 @@ form of the recordings, `{"name": ..., "fields": {...}}`; `to_wire` and `from_wi
 from __future__ import annotations
 
 import math
+import shutil
 import struct
 import tempfile
+import weakref
 from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -191,8 +193,9 @@ class Rig:
             ServerLink(near_gcs, Connection(1, 1, datagram=True), 0, "gcs"),
             ServerLink(near_api, Connection(1, 1, datagram=True), 1, "onboard"),
         ]
-        self._folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
-        files = VehicleFiles(logs=Path(self._folder.name))
+        folder = tempfile.mkdtemp()
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        files = VehicleFiles(logs=Path(folder))
         self.server = VehicleServer(self.vehicle, links, utc_boot_us=UTC_BOOT_US, strict=True, files=files)
         self.gcs, self.api = Station(far_gcs, 255), Station(far_api, 245)
         self.heartbeats = True

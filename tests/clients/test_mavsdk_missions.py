@@ -19,7 +19,7 @@ from mavsdk.plugins.mission_raw.mission_raw import MissionItem as RawItem  # noq
 from mavsdk.plugins.mission_raw.mission_raw import MissionRawError, MissionRawResult  # noqa: E402
 
 METRES_PER_DEGREE = 111_195.0
-WAYPOINT, RETURN, LAND, TAKEOFF = 16, 20, 21, 22
+WAYPOINT, LAND, TAKEOFF = 16, 21, 22
 
 
 @pytest.fixture(scope="module")

@@ -42,7 +42,7 @@ class VehicleProcess:
         folder: what it printed is in sitl.log there.
     """
 
-    def __init__(self, folder: Path, port: int, words: list[str], env: dict[str, str] | None = None) -> None:
+    def __init__(self, folder: Path, port: int, words: list[str]) -> None:
         self.port = port
         self.folder = folder
         self._log = folder / "sitl.log"
@@ -52,7 +52,7 @@ class VehicleProcess:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 cwd=folder,
-                env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", **(env or {})},
+                env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"},
             )
         # Compiling the control laws comes first where nobody has flown yet.
         end = time.monotonic() + 150

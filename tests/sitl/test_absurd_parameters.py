@@ -101,7 +101,7 @@ WHOLE_SETTINGS = st.lists(st.tuples(st.sampled_from(INTEGERS), st.sampled_from(W
 STEP = st.tuples(st.sampled_from(MODES), st.sampled_from([*STICKS, None]), REAL_SETTINGS, st.booleans())
 
 
-@settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(before=REAL_SETTINGS, whole=WHOLE_SETTINGS, steps=st.lists(STEP, min_size=1, max_size=6))
 def test_flights_with_several_at_once(
     flight: Any,

@@ -86,6 +86,14 @@ class TestModes:
 
 
 class TestMission:
+    def test_knows_home_as_soon_as_the_commander_does(self, flight: Any, flown: Any) -> None:
+        autopilot = flight().autopilot
+        autopilot.control.mission.load((flown.rise(5.0), flown.waypoint(12.0, 0.0, 5.0)))
+        assert autopilot.control.mission.home is autopilot.home
+        assert autopilot.control.mission.valid
+        autopilot.command_set_home(*geodetic((15.0, 5.0, 0.0)))
+        assert autopilot.control.mission.home is autopilot.home
+
     def test_without_one_it_does_not_start(self, ground: Any) -> None:
         assert ground.autopilot.command_mission_start() is Result.DENIED
         ground.listen()
