@@ -71,6 +71,7 @@ class Fleet:
         self._tell = tell
         self._close = close
         self._readiness = Readiness(self.servers)
+        self._behind = False
 
     def run(self, *, stop: Callable[[], bool], report: Callable[[FleetStatus], object] | None = None) -> FleetStatus:
         """Serve until `stop` says so or no vehicle is left; then close the vehicles, but not their links.
@@ -106,6 +107,8 @@ class Fleet:
                 self._listen(0.0)
             elif not self._wait(pace, stop):
                 break
+            else:
+                self._behind = pace.remaining_us() <= 0
             self._each(self._tick)
             tick += 1
             if report is not None and tick % _WATCH_TICKS == 0:
@@ -141,6 +144,7 @@ class Fleet:
 
     def _tick(self, server: VehicleServer) -> None:
         """One tick of one vehicle, what has come before it being read already (`VehicleServer.step`)."""
+        server.behind = self._behind
         server.advance()
 
     def _each(self, run: Callable[[VehicleServer], object]) -> None:

@@ -83,14 +83,16 @@ class GroundCommands:
             return Result.TEMPORARILY_REJECTED
         return self._server.services.store(command.params[0])
 
-    def _reboot(self, command: Command) -> Result:
+    def _reboot(self, command: Command) -> Result | None:
         wish = command.whole(1)
         if wish == 0:
             return Result.ACCEPTED
         if self._autopilot.armed or wish != 2:
             return Result.DENIED
+        # there is no later turn to answer in
+        self._server.acknowledge(command.number, Result.ACCEPTED, *command.sender, now=True)
         self._server.shutdown_asked = True
-        return Result.ACCEPTED
+        return None
 
     def _test_actuator(self, command: Command) -> Result | None:
         """ACTUATOR_TEST: turns one motor for at most three seconds; servos are none."""

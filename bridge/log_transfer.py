@@ -188,7 +188,7 @@ class LogServer:
                 self.refused += 1  # deleted meanwhile
                 return
             link.log_id, link.size = number, min(log.size, _UINT32_MAX)
-        if offset >= link.size:
+        if offset >= link.size + DATA_BYTES:
             self.refused += 1
             return
         link.offset = offset
@@ -199,6 +199,10 @@ class LogServer:
         if offset is None or file is None:
             link.stop()
             return []
+        if offset >= link.size:
+            # Just behind the end: an empty packet says that there is no more, which some readers wait for.
+            link.stop()
+            return [("LOG_DATA", {"id": link.log_id, "ofs": offset, "count": 0})]
         packets = min(link.burst, -(-max(link.end - offset, 1) // DATA_BYTES))
         wanted = min(packets * DATA_BYTES, link.size - offset)
         try:

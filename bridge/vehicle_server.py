@@ -37,6 +37,7 @@ _BYTES_PER_TICK = 16_384
 _QUIET_US = 100_000
 """A stream that is silent for so long does not go on with the frame it has begun."""
 _PEERS_KEPT = 128
+_PUT_OFF_MOST = 10
 _TEXTS_AT_ONCE, _TEXT_EVERY_US = 50, 50_000
 """Texts that may be said at once, and how long it takes until there may be one more: nobody can flood a link."""
 _LOST_PEER_PAUSE_US = 100_000
@@ -58,6 +59,8 @@ class VehicleServer:
         forwarder: passes frames on between the links.
         refusals: messages that made no sense to a handler here; `refused` counts those of the services, too.
         defects: handlers that failed on a message; 0 unless there is a bug in here.
+        behind: the next tick is due already. What is sent in bursts then waits, or ticks that are made up for would
+            send it faster than anybody can read; it waits for ten of them at most.
         shutdown_asked: a ground station asked the vehicle to switch off.
     """
 
@@ -78,6 +81,8 @@ class VehicleServer:
         self.defects = 0
         self.refusals = 0
         self.shutdown_asked = False
+        self.behind = False
+        self._put_off = 0
         self._said_us: dict[str, int] = {}
         self._text_room, self._text_us = _TEXTS_AT_ONCE * _TEXT_EVERY_US, 0
         self._acknowledged: list[tuple[int, Result, int, int]] = []
@@ -142,8 +147,7 @@ class VehicleServer:
     def speak(self) -> None:
         """Send the telemetry, texts and parameters that are due on every link."""
         now_us = self.vehicle.time_us
-        while self._acknowledged:
-            self._acknowledge(*self._acknowledged.pop(0))
+        self._send_acknowledgements()
         for link in self.links:
             if now_us >= link.resting_until_us:
                 self.source.link = link
@@ -178,6 +182,7 @@ class VehicleServer:
 
     def close(self) -> None:
         """End what is being written; the links stay open. Raises FileError as `Services.close`."""
+        self._send_acknowledgements()
         self.services.close()
 
     def say(self, severity: Severity, text: str) -> None:
@@ -217,6 +222,10 @@ class VehicleServer:
             self._acknowledge(command, result, sysid, compid)
         else:
             self._acknowledged.append((command, result, sysid, compid))
+
+    def _send_acknowledgements(self) -> None:
+        while self._acknowledged:
+            self._acknowledge(*self._acknowledged.pop(0))
 
     def _acknowledge(self, command: int, result: Result, sysid: int, compid: int) -> None:
         fields = {"command": command, "result": int(result), "target_system": sysid, "target_component": compid}
@@ -295,13 +304,15 @@ class VehicleServer:
             self.say(text.severity, text.text)
         self.services.poll(now_us)
         self.commands.ground.poll(now_us)
+        self._put_off = self._put_off + 1 if self.behind and self._put_off < _PUT_OFF_MOST else 0
+        services = () if self._put_off else self.services.all
         for link in self.links:
             if now_us < link.resting_until_us:
                 continue
             try:
                 if link.texts:
                     link.send_texts(now_us)
-                for service in self.services.all:
+                for service in services:
                     for name, fields in service.poll(link.link_id, now_us):
                         link.send(name, fields)
             except (PeerLost, LinkClosed):

@@ -131,7 +131,9 @@ def test_data_needs_a_list_and_a_log_that_is_there(peer):
     assert peer.data(0, 0, 90) == []
     peer.list()
     assert peer.data(2, 0, 90) == []
-    assert peer.data(0, 1000, 90) == []
+    assert [(one.ofs, one.count) for one in peer.data(0, 1000, 90)] == [(1000, 0)]  # the end, and nothing more
+    assert [(one.ofs, one.count) for one in peer.data(0, 1089, 90)] == [(1089, 0)]
+    assert peer.data(0, 1090, 90) == []
     assert peer.data(0, 0xFFFFFFFF, 0xFFFFFFFF) == []
     assert peer.server.refused == 4
 

@@ -182,7 +182,12 @@ class TestRadio:
         one.run(1.0, one.at_20_hz(send))
         shown = one.ground.named("RC_CHANNELS")
         assert len(shown) == pytest.approx(20, abs=2)
-        assert (shown[-1].chancount, shown[-1].chan1_raw, shown[-1].chan2_raw, shown[-1].chan9_raw) == (18, 1111, 0, 1999)
+        assert (shown[-1].chancount, shown[-1].chan1_raw, shown[-1].chan2_raw, shown[-1].chan9_raw) == (
+            18,
+            1111,
+            0,
+            1999,
+        )
         one.run(0.52)
         one.forget()
         one.run(0.5)

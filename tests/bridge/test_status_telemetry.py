@@ -32,7 +32,12 @@ def octo() -> Source:
     """A vehicle with eight motors, spinning on the ground."""
     model = resolve_vehicle("ant-x")
     rotors = tuple(
-        replace(model.airframe.rotors[0], px_m=math.cos(k * math.pi / 4), py_m=math.sin(k * math.pi / 4), km=0.05 * (-1) ** k)
+        replace(
+            model.airframe.rotors[0],
+            px_m=math.cos(k * math.pi / 4),
+            py_m=math.sin(k * math.pi / 4),
+            km=0.05 * (-1) ** k,
+        )
         for k in range(8)
     )
     vehicle = Vehicle(replace(model, airframe=replace(model.airframe, rotors=rotors)), get_profile("sitl"))
@@ -185,7 +190,12 @@ class TestRemoteIdentification:
         who = request(one, "OPEN_DRONE_ID_SYSTEM", 12904)
         assert (who.operator_latitude, who.operator_longitude) == pytest.approx((475000000, 82500000), abs=20)
         assert who.operator_altitude_geo == 512.0
-        assert (who.operator_location_type, who.area_count, who.area_ceiling, who.area_floor) == (0, 1, -1000.0, -1000.0)
+        assert (who.operator_location_type, who.area_count, who.area_ceiling, who.area_floor) == (
+            0,
+            1,
+            -1000.0,
+            -1000.0,
+        )
         assert who.timestamp == pytest.approx(UTC_US // 1_000_000 - 1_546_300_800 + 3, abs=1)
 
     def test_without_the_time_of_day(self, on_ground: Any) -> None:
