@@ -39,7 +39,7 @@ class TestAcknowledgement:
         on_ground.ground.send("PING", time_usec=5, seq=1)
         on_ground.ground.send("COMMAND_LONG", command=MODE, param1=1, param2=4, param3=3, **target)
         on_ground.run(0.004)
-        heard = [one for one in on_ground.ground.named("COMMAND_ACK", "PROTOCOL_VERSION", "PING")]
+        heard = on_ground.ground.named("COMMAND_ACK", "PROTOCOL_VERSION", "PING")
         assert [one.command if one.name == "COMMAND_ACK" else one.name for one in heard] == [
             "PROTOCOL_VERSION",
             REQUEST,

@@ -323,9 +323,10 @@ def said_in(tree: ast.AST) -> Iterator[list[str | None]]:
             pieces = [part.value if isinstance(part, ast.Constant) else None for part in node.values]
             if isinstance(pieces[-1], str) and pieces[-1].endswith("\t"):
                 yield [piece if isinstance(piece, str) else None for piece in pieces]
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in inside:
-            if node.value.endswith("\t") and node.value.strip():
-                yield [node.value]
+        elif isinstance(node, ast.Constant) and node not in inside:
+            text = node.value
+            if isinstance(text, str) and text.endswith("\t") and text.strip():
+                yield [text]
 
 
 # What a text that is put together says where its program has a value that is no number.
