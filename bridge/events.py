@@ -102,7 +102,8 @@ class EventServer:
             self._links.add(link_id)
             self._seen.setdefault(link_id, _START)
             self._due_us[link_id] = now_us + _SEQUENCE_US
-            return [("CURRENT_EVENT_SEQUENCE", {"sequence": self._next - 1 & 0xFFFF, "flags": _RESET})]
+            # the number before the first that follows: a receiver takes what it already counts as had for a repeat
+            return [("CURRENT_EVENT_SEQUENCE", {"sequence": self._seen[link_id] - 1 & 0xFFFF, "flags": _RESET})]
         seen = self._seen[link_id]
         if seen != self._next:
             unseen = self._next - seen & 0xFFFF

@@ -19,7 +19,7 @@ _G = 9.80665
 _NAN = math.nan
 _ESTIMATOR_GOOD = 831  # attitude, velocities, positions and their predictions; no height above ground
 _HIGHRES_ALL_BUT_AIRSPEED = 0x1BFF
-_PWM_DISARMED_US = 900
+_PWM_DISARMED_US = 900.0
 _TEMPERATURE_C = 15.0
 _MILLI_G = 1000.0 / _G
 _UTC_2001_US = 978_307_200_000_000
@@ -144,14 +144,19 @@ def servo_output_raw(source: Source) -> Fields:
     autopilot = source.vehicle.autopilot
     fields: Fields = {"time_usec": source.time_us & 0xFFFFFFFF}
     for index, motor in enumerate(autopilot.motors, start=1):
-        fields[f"servo{index}_raw"] = uint16(1000.0 + 1000.0 * motor) if autopilot.armed else _PWM_DISARMED_US
+        fields[f"servo{index}_raw"] = uint16(_pwm_us(motor, armed=autopilot.armed))
     return fields
+
+
+def _pwm_us(motor: float, *, armed: bool) -> float:
+    """Pulse width of a motor's signal; disarmed only a motor under test turns."""
+    return 1000.0 + 1000.0 * motor if armed or motor > 0.0 else _PWM_DISARMED_US
 
 
 def actuator_output_status(source: Source) -> Fields:
     """ACTUATOR_OUTPUT_STATUS: the same PWM values with a mask of those in use."""
     autopilot = source.vehicle.autopilot
-    pwm = [1000.0 + 1000.0 * motor if autopilot.armed else float(_PWM_DISARMED_US) for motor in autopilot.motors]
+    pwm = [_pwm_us(motor, armed=autopilot.armed) for motor in autopilot.motors]
     return {
         "time_usec": source.time_us,
         "active": (1 << len(pwm)) - 1,
