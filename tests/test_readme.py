@@ -342,7 +342,7 @@ def port() -> Iterator[int]:
         probe.bind(("127.0.0.1", 0))
         number: int = probe.getsockname()[1]
     # fmt: off
-    command = [sys.executable, "-m", "scenarios.cli", "sitl", "ant-x", "--speed", "2",
+    command = [sys.executable, "-m", "scenarios.cli", "sitl", "ant-x", "--speed", "2", "--no-log",
                "--link", f"udpout://127.0.0.1:{number}#onboard"]
     # fmt: on
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE) as vehicle:

@@ -74,7 +74,7 @@ def test_a_fleet_keeps_its_rates(capsys, vehicles):
     ears = {mode: ear() for mode in MODES}
     links = [f"--link=udpout://127.0.0.1:{sock.getsockname()[1]}#{mode}" for mode, sock in ears.items()]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    command = [sys.executable, "-m", "scenarios.cli", "sitl", f"ant-x*{vehicles}", *links]
+    command = [sys.executable, "-m", "scenarios.cli", "sitl", f"ant-x*{vehicles}", "--no-log", *links]
     fleet = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     try:
         if hasattr(os, "sched_setaffinity"):

@@ -59,7 +59,15 @@ class Station:
 @pytest.fixture(scope="module")
 def station() -> Iterator[Station]:
     one = Station()
-    command = [sys.executable, "-m", "scenarios.cli", "sitl", "ant-x", f"--link=udpout://127.0.0.1:{one.port}"]
+    command = [
+        sys.executable,
+        "-m",
+        "scenarios.cli",
+        "sitl",
+        "ant-x",
+        "--no-log",
+        f"--link=udpout://127.0.0.1:{one.port}",
+    ]
     vehicle = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     one.wait(lambda message: message.name == "HEARTBEAT", 60.0)
     yield one

@@ -78,7 +78,7 @@ def serve() -> Iterator[Callable[[int], Process]]:
     started: list[Process] = []
 
     def start(port: int) -> Process:
-        process = froude("sitl", "ant-x", "--speed", SPEED, "--link", f"udpout://127.0.0.1:{port}#onboard")
+        process = froude("sitl", "ant-x", "--no-log", "--speed", SPEED, "--link", f"udpout://127.0.0.1:{port}#onboard")
         started.append(process)
         assert process.stdout is not None
         assert "serving" in process.stdout.readline()

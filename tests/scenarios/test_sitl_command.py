@@ -31,7 +31,8 @@ def sitl(capsys: pytest.CaptureFixture[str]) -> Sitl:
     def run(*words: object) -> tuple[int, str, str]:
         capsys.readouterr()
         try:
-            status = main(["sitl", *map(str, words)])
+            logs = () if "--log-dir" in words else ("--no-log",)
+            status = main(["sitl", *map(str, words), *logs])
         except SystemExit as end:
             status = int(end.code or 0)
         return status, *capsys.readouterr()
@@ -178,7 +179,7 @@ class TestMistakes:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_fleet_of_its_own_ends_in_order(ear: Ear, number: signal.Signals) -> None:
     url = f"udpout://127.0.0.1:{ear.port}"
-    command = [sys.executable, "-m", "scenarios.cli", "sitl", "ant-x*2", "--link", url, "--status"]
+    command = [sys.executable, "-m", "scenarios.cli", "sitl", "ant-x*2", "--no-log", "--link", url, "--status"]
     with subprocess.Popen(
         command, cwd=Path(cli.__file__).parents[1], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as fleet:
