@@ -180,8 +180,8 @@ def exposure(links: Sequence[ServerLink], *, guarded: bool) -> str | None:
     if guarded:
         return f"{opened} Whoever reaches it can listen; only signed messages are obeyed"
     return (
-        f"{opened} Whoever reaches it can arm, fly and change every parameter; --signing-key FILE together with "
-        f"MAV_SIGN_CFG 2 leaves that to those who have the key"
+        f"{opened} Whoever reaches it can arm, fly and change every parameter; --signing-key FILE "
+        f"leaves that to those who have the key"
     )
 
 

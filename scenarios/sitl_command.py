@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"write flight logs (ULog) here; of several in DIR/0, DIR/1 ... (default: {LOGS})",
     )
     add("--no-log", action="store_true", help="write no flight logs")
-    add("--signing-key", type=Path, metavar="FILE", help="MAVLink 2 signing key; MAV_SIGN_CFG says what is refused")
+    add("--signing-key", type=Path, metavar="FILE", help="sign messages and refuse unsigned ones, with the key in here")
     add("--status", action="store_true", help="a status line every second, also where there is no terminal")
 
 
