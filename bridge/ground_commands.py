@@ -26,6 +26,7 @@ _CALIBRATIONS = (
     (5, 4, "accel"),
 )
 _RADIO_CALIBRATION = 4
+_TEMPERATURE, _ESC_CALIBRATION = 3, 7
 _STOP_LOGGING_US = 1_000_000
 """PX4 answers LOGGING_STOP only about a second later, when its log stream has ended."""
 _FIRST_MOTOR, _LAST_MOTOR, _FIRST_SERVO, _LAST_SERVO = 1, 12, 33, 40
@@ -67,9 +68,13 @@ class GroundCommands:
         while self._later and self._later[0][0] <= now_us:
             self._later.pop(0)[1]()
 
-    def _calibrate(self, command: Command) -> Result:
+    def _calibrate(self, command: Command) -> Result | None:
         if self._autopilot.armed:
             return Result.TEMPORARILY_REJECTED
+        if any(command.whole(index) == _TEMPERATURE for index in (1, 5, 7)):
+            return None  # a PX4 leaves it to a module that simulated sensors have no use for
+        if command.whole(_ESC_CALIBRATION) == 1:
+            return Result.DENIED  # never with a battery connected
         for index, value, name in _CALIBRATIONS:
             if command.whole(index) == value:
                 self._server.say(Severity.INFO, f"[cal] calibration started: 2 {name}")

@@ -63,8 +63,16 @@ def protocol_version(_source: Source, _: int) -> list[Fields]:
 
 
 def flight_information(source: Source, _: int) -> list[Fields]:
-    """FLIGHT_INFORMATION (264): UTC times of arming and take-off are not kept."""
-    return [{"time_boot_ms": source.time_ms}]
+    """FLIGHT_INFORMATION (264): when it was armed and took off, in microseconds UTC; 0 disarmed, or UTC unknown."""
+    autopilot, boot_us = source.vehicle.autopilot, source.utc_boot_us
+    armed_us, took_off_us = autopilot.armed_us, autopilot.took_off_us
+    return [
+        {
+            "time_boot_ms": source.time_ms,
+            "arming_time_utc": boot_us + armed_us if boot_us and armed_us is not None else 0,
+            "takeoff_time_utc": boot_us + took_off_us if boot_us and took_off_us is not None else 0,
+        }
+    ]
 
 
 def available_modes(_: Source, index: int) -> list[Fields]:

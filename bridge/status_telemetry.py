@@ -18,6 +18,8 @@ _UNKNOWN_S = -1
 _UTC_2019_S = 1_546_300_800
 """Open Drone ID counts seconds from 2019-01-01."""
 _UNKNOWN_TIME = 65535.0
+_UTM_TIME_POSITION_ALTITUDES_VELOCITIES = 0x7F & ~0x10
+"""UTM_DATA_AVAIL_FLAGS: all but the next way-point."""
 _WITHIN_10_M, _WITHIN_3_M, _WITHIN_1_M_S, _WITHIN_100_MS = 10, 5, 3, 1
 """Accuracy classes of Open Drone ID: horizontal, vertical, speed, time."""
 
@@ -169,4 +171,59 @@ def open_drone_id_system(source: Source) -> Fields:
         "area_ceiling": -1000.0,
         "area_floor": -1000.0,
         "timestamp": max(0, utc_s - _UTC_2019_S) if source.utc_boot_us else 0,
+    }
+
+
+def open_drone_id_basic_id(source: Source) -> Fields:
+    """OPEN_DRONE_ID_BASIC_ID: a serial number of its own for each simulated vehicle."""
+    return {"id_type": 1, "ua_type": 2, "uas_id": b"FROUDE%d" % source.sysid}
+
+
+def utm_global_position(source: Source) -> Fields:
+    """UTM_GLOBAL_POSITION: place and velocity for air traffic; who the vehicle is, is not told."""
+    vehicle = source.vehicle
+    lat, lon, altitude_m = geodetic(vehicle.estimate.position_ned(), vehicle.origin)
+    vx, vy, vz = vehicle.estimate.velocity_ned()
+    on_ground = vehicle.autopilot.landed_state is LandedState.ON_GROUND
+    gps = vehicle.gps()
+    return {
+        "time": source.utc_boot_us + source.time_us if source.utc_boot_us else 0,
+        "lat": int32(lat * 1e7),
+        "lon": int32(lon * 1e7),
+        "alt": int32(altitude_m * 1000.0),
+        "relative_alt": int32(above_home_m(source) * 1000.0),
+        "vx": int16(vx * 100.0),
+        "vy": int16(vy * 100.0),
+        "vz": int16(vz * 100.0),
+        "h_acc": uint16(gps.eph_m * 1000.0),
+        "v_acc": uint16(gps.epv_m * 1000.0),
+        "flight_state": 2 if on_ground else 3,
+        "flags": _UTM_TIME_POSITION_ALTITUDES_VELOCITIES,
+    }
+
+
+def high_latency(source: Source) -> Fields:
+    """HIGH_LATENCY2: everything in one short message, for a slow link."""
+    vehicle = source.vehicle
+    lat, lon, altitude_m = geodetic(vehicle.estimate.position_ned(), vehicle.origin)
+    vx, vy, vz = vehicle.estimate.velocity_ned()
+    thrust = abs(vehicle.autopilot.attitude_sp.thrust) if vehicle.autopilot.armed else 0.0
+    heading_deg = math.degrees(vehicle.estimate.euler()[2]) % 360.0
+    return {
+        "timestamp": source.time_ms & 0xFFFFFFFF,
+        "type": source.mav_type,
+        "autopilot": 12,
+        "custom_mode": source.custom_mode >> 16 & 0xFFFF,
+        "latitude": int32(lat * 1e7),
+        "longitude": int32(lon * 1e7),
+        "altitude": int16(altitude_m),
+        "target_altitude": int16(altitude_m),
+        "heading": whole(heading_deg / 2.0, 0, 180),
+        "target_heading": whole(heading_deg / 2.0, 0, 180),
+        "throttle": whole(thrust * 100.0, 0, 100),
+        "groundspeed": whole(math.hypot(vx, vy) * 5.0, 0, 255),
+        "eph": 255,
+        "epv": 255,
+        "climb_rate": whole(-vz * 10.0, -127, 127),
+        "battery": whole(vehicle.battery().remaining * 100.0, 0, 100),
     }

@@ -75,6 +75,16 @@ class Autopilot(Commander):
         return {Mode.TAKEOFF: LandedState.TAKEOFF, Mode.LAND: LandedState.LANDING}.get(self.mode, LandedState.IN_AIR)
 
     @property
+    def armed_us(self) -> int | None:
+        """Vehicle time of arming, None while disarmed."""
+        return self._armed_us if self.armed else None
+
+    @property
+    def took_off_us(self) -> int | None:
+        """Vehicle time of taking off, None while disarmed or before."""
+        return self._landing.took_off_us if self.armed else None
+
+    @property
     def attitude_sp_count(self) -> int:
         """How many attitude set-points there have been: cheap to watch for a new one."""
         return self.control.attitude_sp_count

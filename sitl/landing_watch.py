@@ -22,6 +22,7 @@ class LandingWatch:
         parameters: COM_DISARM_LAND, COM_DISARM_PRFLT.
 
     Attributes:
+        took_off_us: vehicle time of the take-off, None before.
         disarm: the text to disarm with; empty while there is no reason to.
     """
 
@@ -33,7 +34,7 @@ class LandingWatch:
         """A new stretch begins."""
         self.disarm = ""
         self._armed_us = now_us
-        self._took_off = False
+        self.took_off_us: int | None = None
         self._landed_us: int | None = None
 
     def update(self, now_us: int, landed: bool) -> Iterator[str]:
@@ -44,10 +45,10 @@ class LandingWatch:
         """
         if not landed:
             self._landed_us = None
-            if not self._took_off:
-                self._took_off = True
+            if self.took_off_us is None:
+                self.took_off_us = now_us
                 yield "Takeoff detected\t"
-        elif self._took_off:
+        elif self.took_off_us is not None:
             if self._landed_us is None:
                 self._landed_us = now_us
                 yield "Landing detected\t"
