@@ -68,7 +68,7 @@ def test_short_messages_say_the_same_as_the_long_ones(flight: Any) -> None:
     assert one.vehicle.autopilot.command_takeoff(None) == 0
     one.run(8.0)
     far, _ = ask(one, 512, UTM_GLOBAL_POSITION, only="UTM_GLOBAL_POSITION")
-    *_, place, _ = ask(one, 512, 33, only="GLOBAL_POSITION_INT")
+    place = next(m for m in ask(one, 512, 33, only="GLOBAL_POSITION_INT") if m.name == "GLOBAL_POSITION_INT")
     short, _ = ask(one, 512, HIGH_LATENCY2, only="HIGH_LATENCY2")
     assert far.flight_state == 3
     assert far.relative_alt == pytest.approx(place.relative_alt, abs=100)
