@@ -85,6 +85,7 @@ class Services:
         utc_boot_us: UTC of vehicle time zero, us; 0 = unknown.
 
     Attributes:
+        all: every service. bursting: those that may have something every few ms.
         params, events: for those who have more to do with them than to carry their messages.
         metadata: what the vehicle says of its parameters and events.
         log: writes the flights; None without a directory.
@@ -136,13 +137,10 @@ class Services:
             **address,
         )
         self.log: FlightLog | None = None
-        self.all: list[Service] = [
-            self.params,
-            self.events,
-            MissionServer(self.plans, say=say, progress=self._progress, **address),
-            FtpServer(tree, **address),
-            self._signing,
-        ]
+        files_server = FtpServer(tree, **address)
+        missions = MissionServer(self.plans, say=say, progress=self._progress, **address)
+        self.all: list[Service] = [self.params, self.events, missions, files_server, self._signing]
+        self.bursting: tuple[Service, ...] = (self.params, files_server, missions)
         if files.logs is not None:
             self.log = FlightLog(
                 files.logs,
@@ -154,7 +152,9 @@ class Services:
             )
             tree.mount("log", files.logs)
             tree.mount("fs/microsd/log", files.logs)
-            self.all.append(LogServer(files.logs, writing=self._written, **address))
+            logs = LogServer(files.logs, writing=self._written, **address)
+            self.all.append(logs)
+            self.bursting = (*self.bursting, logs)
 
     @property
     def refused(self) -> int:

@@ -24,13 +24,15 @@ from bridge.offboard import OffboardSetpoints
 from bridge.server_link import ServerLink
 from bridge.services import Service, Services, VehicleFiles
 from bridge.telemetry import Source
-from sitl.modes import Result, Severity
+from sitl.modes import Mode, Result, Severity
 from sitl.vehicle import Vehicle
 
 __all__ = ["ServerLink", "VehicleServer"]
 
 _MAV_TYPE_GCS = 6
-_HOUSEKEEPING_US = 4_000
+_BURST_US = 4_000
+_SLOW_US = 20_000
+"""How often services are asked for what is due: while one sends in bursts, and otherwise."""
 _REPEAT_US = 1_000_000
 _DATAGRAMS_PER_TICK = 64
 _BYTES_PER_TICK = 16_384
@@ -103,7 +105,7 @@ class VehicleServer:
         self.forwarder = Forwarder(self.links, system_id=self.sysid, component_id=self.compid, lost=self._peer_lost)
         self._log = self.services.log
         self._forwards = len(self.links) > 1
-        self._housekeeping_us = 0
+        self._housekeeping_us = self._slow_us = 0
         self.commands = Commands(self)
         self._handlers: dict[str, Callable[[ServerLink, Any], None]] = {
             "HEARTBEAT": self._heartbeat,
@@ -147,7 +149,8 @@ class VehicleServer:
     def speak(self) -> None:
         """Send the telemetry, texts and parameters that are due on every link."""
         now_us = self.vehicle.time_us
-        self._send_acknowledgements()
+        if self._acknowledged:
+            self._send_acknowledgements()
         for link in self.links:
             if now_us >= link.resting_until_us:
                 self.source.link = link
@@ -158,8 +161,7 @@ class VehicleServer:
                 except Exception as error:
                     self._defect("telemetry", error)
         if now_us >= self._housekeeping_us:
-            self._housekeeping_us = now_us + _HOUSEKEEPING_US
-            self._keep_house()
+            self._housekeeping_us = now_us + (_BURST_US if self._keep_house() else _SLOW_US)
 
     def listen(self) -> None:
         """Read every link and answer; between two ticks this makes answers quicker than the tick is long."""
@@ -294,18 +296,22 @@ class VehicleServer:
         self.defects += 1
         self.say_at_times(Severity.ERROR, where, f"{where} hit a defect: {type(error).__name__}: {error}")
 
-    def _keep_house(self) -> None:
-        """Send texts, parameters, files and whatever else waits."""
+    def _keep_house(self) -> bool:
+        """Send texts, parameters, files and whatever else waits; return whether there is likely to be more at once."""
         now_us = self.vehicle.time_us
-        autopilot = self.vehicle.autopilot
-        if self.hears_gcs():
-            autopilot.gcs_heard()
-        for text in autopilot.take_texts():
+        # items of a mission may be reached one right after the other
+        busy = self._put_off > 0 or self.vehicle.autopilot.mode is Mode.MISSION
+        for text in self.vehicle.autopilot.take_texts():
             self.say(text.severity, text.text)
-        self.services.poll(now_us)
-        self.commands.ground.poll(now_us)
         self._put_off = self._put_off + 1 if self.behind and self._put_off < _PUT_OFF_MOST else 0
-        services = () if self._put_off else self.services.all
+        services = () if self._put_off else self.services.bursting
+        if now_us >= self._slow_us:
+            self._slow_us = now_us + _SLOW_US
+            if self.hears_gcs():
+                self.vehicle.autopilot.gcs_heard()
+            self.services.poll(now_us)
+            self.commands.ground.poll(now_us)
+            services = tuple(self.services.all)
         for link in self.links:
             if now_us < link.resting_until_us:
                 continue
@@ -315,10 +321,12 @@ class VehicleServer:
                 for service in services:
                     for name, fields in service.poll(link.link_id, now_us):
                         link.send(name, fields)
+                        busy = True
             except (PeerLost, LinkClosed):
                 self._peer_lost(link)
             except Exception as error:
                 self._defect("housekeeping", error)
+        return busy
 
     def _peer_lost(self, link: Any) -> None:
         """Forget who was there; a listening link may get another peer, so try again a little later."""

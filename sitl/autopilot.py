@@ -167,7 +167,8 @@ class Autopilot(Commander):
             self.think(now_us)
         outputs = self.control.run()
         if self.armed:
-            self.control.guide(now_us, self.mode, self.land_detector, self.home)
+            if self.mode is not Mode.OFFBOARD or self.control.by_position:
+                self.control.guide(now_us, self.mode, self.land_detector, self.home)
             self._tested = None
         elif self._tested is not None:
             motor, value, until_us = self._tested

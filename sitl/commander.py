@@ -24,6 +24,9 @@ from sitl.setpoints import Reposition
 READY_US = 2_000_000
 """Vehicle time until sensors and estimator count as healthy, us."""
 
+_WISHFUL = frozenset({Mode.TAKEOFF, Mode.VTOL_TAKEOFF, Mode.MISSION})
+"""Modes that want another when they are done."""
+
 _TELL_WHY_US = 400_000
 _STICKS_OVER_AUTO, _STICKS_OVER_OFFBOARD = 1, 2
 
@@ -240,9 +243,10 @@ class Commander:
         self._texts += self.control.take_texts()
         if self.manual.moving:
             self._sticks_take_over()
-        wish = self.control.wish
-        if wish is not None and self.mode is self.intended:
-            self._choose(wish)
+        if self.mode in _WISHFUL and self.mode is self.intended:
+            wish = self.control.wish
+            if wish is not None:
+                self._choose(wish)
         if not self.terminated:
             self._act()
 
@@ -299,13 +303,15 @@ class Commander:
 
     def _act(self) -> None:
         """Fly the user's mode or what a failsafe wants."""
-        choice = self._failsafe.choose(self._now_us, self.intended, self._links())
+        links = self._links()
+        quiet = self.mode is self.intended and self._action is Action.NONE
+        if quiet and self._failsafe.calm(self._now_us, self.mode, links):
+            self.failsafe = self._tilt_warned
+            return
+        choice = self._failsafe.choose(self._now_us, self.intended, links)
         if choice.action > max(self._action, Action.WARN):
-            if choice.delayed_s:
-                text = f"Failsafe activated: entering Hold for {choice.delayed_s:.0f} seconds\t"
-                self.say(Severity.CRITICAL, text)
-            else:
-                self.say(Severity.CRITICAL, "Failsafe activated\t")
+            hold = f"Failsafe activated: entering Hold for {choice.delayed_s:.0f} seconds\t"
+            self.say(Severity.CRITICAL, hold if choice.delayed_s else "Failsafe activated\t")
         self._action = choice.action
         self.failsafe = choice.action > Action.WARN or self._tilt_warned
         if choice.action is Action.DISARM:

@@ -184,6 +184,8 @@ class Guide:
 
     def take_texts(self) -> list[Text]:
         """What mission and return have said since the last call."""
+        if not self.mission.texts and not self.home_run.texts:
+            return []
         texts = [*self.mission.texts, *self.home_run.texts]
         self.mission.texts.clear()
         self.home_run.texts.clear()
