@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import signal
@@ -14,14 +15,19 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 
 
+_BELOW_EPHEMERAL = range(12_000, 32_000)
+_tried = itertools.count(os.getpid() * 37)
+
+
 def free_port(count: int = 1) -> int:
-    """Return the first of so many UDP ports of the loopback that nobody uses, one behind the other."""
-    for _ in range(100):
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first:
-            first.bind(("127.0.0.1", 0))
-            port: int = first.getsockname()[1]
-            if count == 1 or (port + count < 65536 and all(map(_is_free, range(port + 1, port + count)))):
-                return port
+    """Return the first of so many UDP ports of the loopback that nobody uses, one behind the other.
+
+    The system gives ports of its own choice from 32768 up: one from there may be another program's a moment later.
+    """
+    for number in itertools.islice(_tried, 200):
+        port = _BELOW_EPHEMERAL[number * 11 % (len(_BELOW_EPHEMERAL) - count)]
+        if all(map(_is_free, range(port, port + count))):
+            return port
     raise AssertionError(f"no {count} free ports behind one another")
 
 
