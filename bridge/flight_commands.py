@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from bridge.px4_modes import PX4_MODES, UnknownModeError, asked_mode
 from sitl.modes import Mode, Result, Severity
+from sitl.plan import RELATIVE_FRAMES
 from sitl.sensors import geodetic
 from sitl.setpoints import Reposition
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from bridge.vehicle_server import VehicleServer
 
 _FORCE = 21196
-_RELATIVE_FRAMES = (3, 6)  # MAV_FRAME_GLOBAL_RELATIVE_ALT, ..._INT
 _CHANGE_MODE = 1  # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE
 _GROUND_STATION = 190  # MAV_COMP_ID_MISSIONPLANNER: PX4 explains a refused mode to nobody else
 _NAN = math.nan
@@ -128,7 +128,7 @@ class FlightCommands:
 
     def _change_altitude(self, command: Command) -> Result:
         altitude_m = command.params[0]
-        if command.whole(2) in _RELATIVE_FRAMES:
+        if command.whole(2) in RELATIVE_FRAMES:
             altitude_m += self._home_amsl_m()
         return self._autopilot.command_reposition(Reposition(_NAN, _NAN, altitude_m, _NAN, _NAN))
 
@@ -155,7 +155,7 @@ class FlightCommands:
 
     def _altitude_amsl_m(self, command: Command) -> float:
         altitude_m = command.params[6]
-        return altitude_m + self._home_amsl_m() if command.frame in _RELATIVE_FRAMES else altitude_m
+        return altitude_m + self._home_amsl_m() if command.frame in RELATIVE_FRAMES else altitude_m
 
     def _home_amsl_m(self) -> float:
         home = self._autopilot.home

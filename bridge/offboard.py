@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from sitl.modes import Severity
+from sitl.plan import GLOBAL_FRAMES, RELATIVE_FRAMES
 from sitl.sensors import local_position
 from sitl.setpoints import PositionRequest
 
@@ -25,7 +26,6 @@ _FORCE, _IGNORE_YAW, _IGNORE_TURN = 512, 1024, 2048
 """POSITION_TARGET_TYPEMASK bits beside the three for each of position (1), velocity (8) and acceleration (64)."""
 
 _LOCAL_NED, _BODY_NED = 1, 8
-_AMSL_FRAMES, _RELATIVE_FRAMES = (0, 5), (3, 6)
 
 
 class OffboardSetpoints:
@@ -102,11 +102,11 @@ class OffboardSetpoints:
         if not self._wanted(msg):
             return
         frame, vehicle = msg.coordinate_frame, self._server.vehicle
-        if frame not in _AMSL_FRAMES + _RELATIVE_FRAMES:
+        if frame not in GLOBAL_FRAMES:
             self._refuse(msg, f"coordinate frame {frame} unsupported")
             return
         home = vehicle.autopilot.home
-        base_m = home.alt_m if frame in _RELATIVE_FRAMES and home is not None else 0.0
+        base_m = home.alt_m if frame in RELATIVE_FRAMES and home is not None else 0.0
         north, east, down = local_position(msg.lat_int * 1e-7, msg.lon_int * 1e-7, base_m + msg.alt)
         mask = msg.type_mask
         position = (

@@ -139,7 +139,7 @@ class Services:
         self.log: FlightLog | None = None
         files_server = FtpServer(tree, **address)
         missions = MissionServer(self.plans, say=say, progress=self._progress, **address)
-        self.all: list[Service] = [self.params, self.events, missions, files_server, self._signing]
+        self.all: tuple[Service, ...] = (self.params, self.events, missions, files_server, self._signing)
         self.bursting: tuple[Service, ...] = (self.params, files_server, missions)
         if files.logs is not None:
             self.log = FlightLog(
@@ -153,7 +153,7 @@ class Services:
             tree.mount("log", files.logs)
             tree.mount("fs/microsd/log", files.logs)
             logs = LogServer(files.logs, writing=self._written, **address)
-            self.all.append(logs)
+            self.all = (*self.all, logs)
             self.bursting = (*self.bursting, logs)
 
     @property

@@ -311,7 +311,7 @@ class VehicleServer:
                 self.vehicle.autopilot.gcs_heard()
             self.services.poll(now_us)
             self.commands.ground.poll(now_us)
-            services = tuple(self.services.all)
+            services = self.services.all
         for link in self.links:
             if now_us < link.resting_until_us:
                 continue

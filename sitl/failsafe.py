@@ -11,7 +11,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import NamedTuple
 
-from sitl.modes import FLOWN_AS, STICK_MODES, Mode
+from sitl.modes import STICK_MODES, Mode, flown_as
 from sitl.parameters import ParameterTable
 
 
@@ -190,7 +190,7 @@ class Failsafe:
             Mode.LOITER: _EXCEPT_HOLD,
             Mode.TAKEOFF: _EXCEPT_HOLD,
             Mode.OFFBOARD: _EXCEPT_OFFBOARD,
-        }.get(FLOWN_AS.get(intended, intended), 0)
+        }.get(flown_as(intended), 0)
         return bool(bits & bit)
 
     def _offboard_action(self, links: Links) -> Action:

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from sitl import control_loop
 from sitl.control_loop import CONTROL_INPUT, CONTROL_SETTINGS, CONTROL_STATE, control_tick, settle_filters
 from sitl.control_settings import control_settings, mix_of, position_settings, position_ticks
-from sitl.guide import ATTITUDE_BY_STICK, Guide, flown_as
+from sitl.guide import ATTITUDE_BY_STICK, Guide
 from sitl.land_detector import LandDetector
-from sitl.modes import Home, Mode, Text
+from sitl.modes import Home, Mode, Text, flown_as
 from sitl.parameters import ParameterTable
 from sitl.plant import Plant
 from sitl.position_control import POSITION_STATE, position_tick

@@ -11,7 +11,7 @@ import math
 from sitl.control_settings import reader
 from sitl.legs import Here, Vec3
 from sitl.mission import MissionRun
-from sitl.modes import FLOWN_AS, Home, Mode, Text
+from sitl.modes import Home, Mode, Text
 from sitl.navigator import Navigator
 from sitl.offboard_motion import offboard_motion, wants_up
 from sitl.parameters import ParameterTable
@@ -26,11 +26,6 @@ ATTITUDE_BY_STICK = frozenset({Mode.MANUAL, Mode.STABILIZED, Mode.ACRO})
 _MOTION_BY_STICK = frozenset({Mode.ALTCTL, Mode.POSCTL})
 _UNGUIDED = ATTITUDE_BY_STICK | {Mode.OFFBOARD, Mode.TERMINATION}
 """Modes in which the position controller does not run (in Offboard it may)."""
-
-
-def flown_as(mode: Mode) -> Mode:
-    """The mode whose law flies a mode."""
-    return FLOWN_AS.get(mode, mode)
 
 
 class Guide:

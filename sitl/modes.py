@@ -105,6 +105,11 @@ NEVER_ARM = frozenset(
 """Modes in which PX4 refuses to arm."""
 
 
+def flown_as(mode: Mode) -> Mode:
+    """The mode whose law flies a mode."""
+    return FLOWN_AS.get(mode, mode)
+
+
 class Result(IntEnum):
     """Answer to a command; the value is MAVLink's MAV_RESULT."""
 
