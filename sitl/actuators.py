@@ -23,8 +23,9 @@ _WEAK_ROW = 0.05
 _WEAK_ENTRY = 1e-3
 _WEAK_DESATURATION = 0.2
 _YAW_MARGIN = 0.15
-_ACHIEVED = 1e-6
-_FLT_EPSILON = 1.1920929e-07
+ACHIEVED = 1e-6
+"""Squared torque that may be missing before an axis counts as saturated."""
+FLT_EPSILON = 1.1920929e-07
 
 
 @dataclass(frozen=True)
@@ -112,13 +113,13 @@ def normalised_mix(rotors: Sequence[RotorEffect]) -> Mix:
     tilt = max(column_scale(mix[:, ROLL]), column_scale(mix[:, PITCH]))
     yaw = float(np.max(mix[:, YAW])) if n else 0.0
     vertical = mix[:, 5]
-    lifting = np.abs(vertical) > _FLT_EPSILON
+    lifting = np.abs(vertical) > FLT_EPSILON
     thrust = float(np.mean(np.abs(vertical[lifting]))) if lifting.any() else 1.0
     columns = np.column_stack(
         [
             mix[:, ROLL] / tilt,
             mix[:, PITCH] / tilt,
-            mix[:, YAW] / yaw if yaw > _FLT_EPSILON else np.zeros(n),
+            mix[:, YAW] / yaw if yaw > FLT_EPSILON else np.zeros(n),
             -vertical / thrust,
         ]
     )
@@ -231,10 +232,10 @@ def saturation(
         for i in range(n):
             given += inverse[axis, i] * motors[i]
         missing[axis] = torque[axis] - given
-    achieved = missing[0] ** 2 + missing[1] ** 2 + missing[2] ** 2 < _ACHIEVED
+    achieved = missing[0] ** 2 + missing[1] ** 2 + missing[2] ** 2 < ACHIEVED
     for axis in range(3):
-        positive[axis] = 1 if not achieved and missing[axis] > _FLT_EPSILON else 0
-        negative[axis] = 1 if not achieved and missing[axis] < -_FLT_EPSILON else 0
+        positive[axis] = 1 if not achieved and missing[axis] > FLT_EPSILON else 0
+        negative[axis] = 1 if not achieved and missing[axis] < -FLT_EPSILON else 0
 
 
 @compiled

@@ -27,11 +27,20 @@ Record = Any
 
 def compiled(function: _Function) -> _Function:
     """Compile a function on its first call, or take the machine code of an earlier run."""
+    return _compiled(function, "never")
+
+
+def inlined(function: _Function) -> _Function:
+    """`compiled`, and set into whatever compiled code calls it: a loop over it can then use the vector unit."""
+    return _compiled(function, "always")
+
+
+def _compiled(function: _Function, inline: str) -> _Function:
     before = numba.config.CACHE_DIR
     # numba reads the folder when the function is decorated; other users of numba in this process keep theirs
     numba.config.CACHE_DIR = str(cache_folder())
     try:
-        made: _Function = numba.njit(cache=True)(function)
+        made: _Function = numba.njit(cache=True, nogil=True, inline=inline)(function)
     finally:
         numba.config.CACHE_DIR = before
     return made
@@ -65,8 +74,24 @@ def is_warm() -> bool:
     return any(cache_folder().rglob("*.nbc"))
 
 
+def is_compiled(law: Callable[..., Any]) -> bool:
+    """Is the machine code of this function there already, in this process or from an earlier one?"""
+    if getattr(law, "signatures", None):
+        return True
+    return any(cache_folder().rglob(f"*.{law.__name__}-*.nbc"))
+
+
 def _forget_old(base: Path) -> None:
     """Remove the folders of all but the latest few versions."""
     folders = sorted(base.glob("laws-*"), key=lambda folder: folder.stat().st_mtime, reverse=True)
     for folder in folders[_KEPT:]:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@compiled
+def select(condition: bool, then: float, otherwise: float) -> float:
+    """``then if condition else otherwise``, as a function: laws written with it also run on arrays.
+
+    See `sitl.array_form`; both values are worked out, so neither may fail when it is not chosen.
+    """
+    return then if condition else otherwise

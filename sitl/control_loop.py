@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sitl.actuators import MAX_MOTORS, allocate, motor_output, saturation
 from sitl.attitude_control import attitude_control, linear_attitude_control
 from sitl.compiled import Record, compiled
-from sitl.filters import biquad, constrain, settle_biquad
+from sitl.filters import biquad, constrain, settle_biquad, slope_step
 from sitl.rate_control import rate_control
 from sitl.rotation import normalise, to_euler
 
@@ -111,8 +111,8 @@ def _filter_gyro(settings: Record, state: Record, gyro: NDArray[np.float64]) -> 
             settle_biquad(settings.low_pass, state.low_pass[axis], sample)
         rate = biquad(settings.low_pass, state.low_pass[axis], sample)
         if state.started:
-            slope = (rate - state.rates[axis]) / settings.dt_s
-            state.accel[axis] += settings.dgyro_alpha * (slope - state.accel[axis])
+            alpha, dt_s = settings.dgyro_alpha, settings.dt_s
+            state.accel[axis] = slope_step(state.accel[axis], rate, state.rates[axis], alpha, dt_s)
         state.rates[axis] = rate
 
 

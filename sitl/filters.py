@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.compiled import compiled
+from sitl.compiled import compiled, select
 
 PASS_THROUGH = (1.0, 0.0, 0.0, 0.0, 0.0)
 """Biquad coefficients (b0, b1, b2, a1, a2) that change nothing."""
@@ -67,11 +67,34 @@ def alpha_of(cutoff_hz: float, dt_s: float) -> float:
 @compiled
 def constrain(value: float, low: float, high: float) -> float:
     """PX4's ``constrain``: a value held between two limits. A NaN value stays NaN, a NaN limit does not limit."""
-    if value < low:
-        return low
-    if value > high:
-        return high
-    return value
+    return select(value < low, low, select(value > high, high, value))
+
+
+@compiled
+def biquad_step(
+    b0: float, b1: float, b2: float, a1: float, a2: float, delay0: float, delay1: float, sample: float
+) -> tuple[float, float]:
+    """Next output of a biquad in direct form II, and what becomes its first memory (the second becomes ``delay0``).
+
+    Args:
+        b0, b1, b2, a1, a2: coefficients.
+        delay0, delay1: the filter's memory.
+        sample: next input.
+    """
+    w = sample - delay0 * a1 - delay1 * a2
+    return w * b0 + delay0 * b1 + delay1 * b2, w
+
+
+@compiled
+def slope_step(slope: float, value: float, last: float, alpha: float, dt_s: float) -> float:
+    """Next output of PX4's D filter: the first-order low pass of a backward difference.
+
+    Args:
+        slope: its last output, 1/s of the value's unit.
+        value, last: this sample and the one before.
+        alpha: weight of the new difference (``alpha_of``). dt_s: between the two, s.
+    """
+    return slope + alpha * ((value - last) / dt_s - slope)
 
 
 @compiled
@@ -83,8 +106,8 @@ def biquad(coefficients: NDArray[np.float64], delay: NDArray[np.float64], sample
         delay: (2,) the filter's memory, updated in place.
         sample: next input.
     """
-    w = sample - delay[0] * coefficients[3] - delay[1] * coefficients[4]
-    output: float = w * coefficients[0] + delay[0] * coefficients[1] + delay[1] * coefficients[2]
+    b0, b1, b2, a1, a2 = coefficients[0], coefficients[1], coefficients[2], coefficients[3], coefficients[4]
+    output, w = biquad_step(b0, b1, b2, a1, a2, delay[0], delay[1], sample)
     delay[1] = delay[0]
     delay[0] = w
     return output

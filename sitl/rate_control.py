@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from sitl.compiled import compiled
+from sitl.compiled import compiled, select
 from sitl.filters import constrain
 
 _I_FACTOR_RATE = math.radians(400.0)
@@ -47,20 +47,14 @@ def rate_control(
     Returns:
         (torque, integral): normalised torque set-point (not clamped), next integrator state.
     """
-    if not math.isfinite(rate_sp):
-        rate_sp = rate
+    # no branches: the same lines run for many vehicles at once, in compiled lanes or on arrays
+    rate_sp = select(math.isfinite(rate_sp), rate_sp, rate)
     error = rate_sp - rate
     torque = k * kp * error + integral - k * kd * accel + kff * rate_sp
-    if not frozen:
-        if positive_saturated:
-            error = min(error, 0.0)
-        if negative_saturated:
-            error = max(error, 0.0)
-        ratio = error / _I_FACTOR_RATE
-        factor = max(0.0, 1.0 - ratio * ratio) if int_lim != math.inf else 1.0
-        moved = integral + factor * k * ki * error * dt_s
-        if math.isfinite(moved):
-            integral = constrain(moved, -int_lim, int_lim)
-    if not math.isfinite(torque):
-        torque = 0.0
-    return torque, integral
+    error = select(positive_saturated, min(error, 0.0), error)
+    error = select(negative_saturated, max(error, 0.0), error)
+    ratio = error / _I_FACTOR_RATE
+    factor = select(int_lim != math.inf, max(0.0, 1.0 - ratio * ratio), 1.0)
+    moved = integral + factor * k * ki * error * dt_s
+    moved = select(math.isfinite(moved), constrain(moved, -int_lim, int_lim), integral)
+    return select(math.isfinite(torque), torque, 0.0), select(frozen, integral, moved)

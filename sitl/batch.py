@@ -1,0 +1,315 @@
+"""Gain sets x samples x ticks of the roll axis in one call, with the laws that fly live (`roll_loop`).
+
+A block of samples is flown side by side in compiled lanes, which the machine's vector unit takes several at a time.
+Where nothing is compiled yet and the job is small, the same laws run on arrays instead (`array_form`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from sitl.actuators import ACHIEVED, FLT_EPSILON
+from sitl.airframe import DERIVATIVE_NAMES
+from sitl.array_form import array_form
+from sitl.compiled import Record, compiled, is_compiled, select
+from sitl.errors import UsageError
+from sitl.filters import biquad_step, constrain
+from sitl.roll_loop import LOST_RAD, RollTorque, gravity_excess, lateral_row, roll_law, roll_torque, step_matrices
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+LANES = 32
+"""Samples flown side by side: enough for the vector unit, few enough to stay in the cache."""
+
+COMPILE_STEPS = 8_000_000
+"""Steps that numpy flies in the time that compiling takes: a smaller job on a cold machine is not compiled."""
+
+
+# Rows of what a lane remembers: plant, gyro filter and its slope, laws, saturation, notches.
+_V, _P, _PHI, _M, _FLIES, _PHI_BEFORE, _SEEN, _MEASURED = range(8)
+_Y, _ACCEL, _DELAY0, _DELAY1, _INTEGRAL, _RATE_SP, _TORQUE, _GIVEN, _POSITIVE, _NEGATIVE = range(8, 18)
+_NOTCH = 18
+_ROWS = _NOTCH + 4
+
+
+@dataclass(frozen=True)
+class RollJob:
+    """What a batch flies: one manoeuvre, from level flight, on every sample with every gain set.
+
+    Attributes:
+        settings: (G,) of CONTROL_SETTINGS, one per gain set, all at one rate.
+        derivatives: (S, 6) in the order of DERIVATIVE_NAMES.
+        motor_lag_s: first-order lag of the motors; 0 for none.
+        delay_ticks: whole ticks between a command and its motor.
+        hover_thrust: collective command, 0..1.
+        phi_sp_rad: (T,) roll set-point of every tick.
+    """
+
+    settings: npt.NDArray[np.void]
+    derivatives: FloatArray
+    motor_lag_s: float
+    delay_ticks: int
+    hover_thrust: float
+    phi_sp_rad: FloatArray
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for shapes and numbers that cannot be flown."""
+        shape = self.derivatives.shape
+        if len(shape) != 2 or shape[1] != len(DERIVATIVE_NAMES) or not shape[0]:
+            raise UsageError(f"samples of derivatives: shape {shape}, want (samples, {len(DERIVATIVE_NAMES)})")
+        if not np.isfinite(self.derivatives).all():
+            row = int(np.flatnonzero(~np.isfinite(self.derivatives).all(axis=1))[0])
+            raise UsageError(f"sample {row} of the derivatives is not finite: {self.derivatives[row].tolist()}")
+        if self.phi_sp_rad.ndim != 1 or not len(self.phi_sp_rad) or not np.isfinite(self.phi_sp_rad).all():
+            raise UsageError(f"set-points: shape {self.phi_sp_rad.shape}, want one finite number per tick")
+        if not (math.isfinite(self.motor_lag_s) and self.motor_lag_s >= 0.0 and self.delay_ticks >= 0):
+            raise UsageError(f"motor lag {self.motor_lag_s} s, delay {self.delay_ticks} ticks: give 0 or more")
+
+    @property
+    def steps(self) -> int:
+        """Vehicle-steps of the whole job."""
+        return len(self.settings) * len(self.derivatives) * len(self.phi_sp_rad)
+
+
+@dataclass(frozen=True)
+class Block:
+    """What some neighbouring samples flew with one gain set.
+
+    Attributes:
+        gain_set: its number. first: number of the first sample.
+        phi_rad, p_rad_s, delta_lat: (T, n) at every tick: before the tick's motion, and the torque of its commands.
+        lost: (n,) the roll angle passed 80 degrees; the rest of that sample is frozen.
+    """
+
+    gain_set: int
+    first: int
+    phi_rad: FloatArray
+    p_rad_s: FloatArray
+    delta_lat: FloatArray
+    lost: BoolArray
+
+
+@compiled
+def fly_lanes(
+    settings_array: npt.NDArray[np.void],
+    matrices: FloatArray,
+    phi_sp: FloatArray,
+    delay_ticks: int,
+    limit: float,
+    clips: bool,
+    most: float,
+    given_table: FloatArray,
+    delta_table: FloatArray,
+    out: FloatArray,
+    lost: BoolArray,
+) -> None:
+    """Fly LANES samples with one gain set.
+
+    Args:
+        settings_array: (1,) of CONTROL_SETTINGS. matrices: (4, 6, LANES) of `step_matrices`, lanes last.
+        phi_sp: (T,). delay_ticks, limit, clips, most, given_table, delta_table: see `RollJob`, `RollTorque`.
+        out: (3, T, LANES) output: phi, p, delta_lat. lost: (LANES,) output.
+    """
+    s: Record = settings_array[0]
+    b0, b1, b2, a1, a2 = s.low_pass[0], s.low_pass[1], s.low_pass[2], s.low_pass[3], s.low_pass[4]
+    alpha, dt_s, linear, late = s.dgyro_alpha, s.dt_s, s.linear, s.rate_sp_late
+    k_phi, rate_max, int_lim = s.att_gain[0], s.rate_max[0], s.int_lim[0]
+    k, kp, ki, kd, kff = s.k[0], s.kp[0], s.ki[0], s.kd[0], s.kff[0]
+    whole = int(s.attitude_late_ticks)
+    part = s.attitude_late_ticks - whole
+    limits, status_ticks, notches = s.limits, s.status_ticks, s.notch_count
+    # one array for everything a lane remembers: the compiler then sees by itself that its rows do not overlap
+    x = np.zeros((_ROWS, LANES))
+    for j in range(LANES):
+        x[_FLIES, j] = 1.0
+    steps_per_unit = (len(given_table) - 1) / (2.0 * most) if not clips else 0.0
+    for t in range(len(phi_sp)):
+        wanted_phi = phi_sp[t]
+        now, before = t - whole, t - whole - 1
+        for j in range(LANES):
+            out[0, t, j] = x[_PHI, j]
+            out[1, t, j] = x[_P, j]
+            x[_MEASURED, j] = x[_P, j]
+        if whole == 0:
+            for j in range(LANES):
+                x[_SEEN, j] = (1.0 - part) * x[_PHI, j] + part * x[_PHI_BEFORE, j]
+                x[_PHI_BEFORE, j] = x[_PHI, j]
+        else:
+            for j in range(LANES):
+                x[_SEEN, j] = (1.0 - part) * (out[0, now, j] if now >= 0 else 0.0) + part * (
+                    out[0, before, j] if before >= 0 else 0.0
+                )
+        for i in range(notches):
+            n = s.notches[i]
+            n0, n1, n2, n3, n4 = n[0], n[1], n[2], n[3], n[4]
+            first, second = _NOTCH + 2 * i, _NOTCH + 2 * i + 1
+            for j in range(LANES):
+                sample, w = biquad_step(n0, n1, n2, n3, n4, x[first, j], x[second, j], x[_MEASURED, j])
+                x[_MEASURED, j] = sample
+                x[second, j] = x[first, j]
+                x[first, j] = w
+        for j in range(LANES):
+            torque, y, accel, w, integral, rate_sp = roll_law(
+                x[_MEASURED, j], x[_SEEN, j], wanted_phi,
+                x[_Y, j], x[_ACCEL, j], x[_DELAY0, j], x[_DELAY1, j], x[_INTEGRAL, j], x[_RATE_SP, j],
+                x[_POSITIVE, j] != 0.0, x[_NEGATIVE, j] != 0.0,
+                b0, b1, b2, a1, a2, alpha, dt_s, k_phi, rate_max, k, kp, ki, kd, kff, int_lim, linear, late,
+            )  # fmt: skip
+            x[_TORQUE, j] = torque
+            x[_Y, j] = y
+            x[_ACCEL, j] = accel
+            x[_DELAY1, j] = x[_DELAY0, j]
+            x[_DELAY0, j] = w
+            x[_INTEGRAL, j] = integral
+            x[_RATE_SP, j] = rate_sp
+        if clips:
+            for j in range(LANES):
+                given = constrain(x[_TORQUE, j], -limit, limit)
+                x[_GIVEN, j] = given
+                out[2, t, j] = given
+        else:
+            for j in range(LANES):
+                place = (constrain(x[_TORQUE, j], -most, most) + most) * steps_per_unit
+                at = min(int(place), len(given_table) - 2)
+                share = place - at
+                x[_GIVEN, j] = given_table[at] + share * (given_table[at + 1] - given_table[at])
+                out[2, t, j] = delta_table[at] + share * (delta_table[at + 1] - delta_table[at])
+        if limits and (t + 1) % status_ticks == 0:
+            for j in range(LANES):
+                missing = x[_TORQUE, j] - x[_GIVEN, j]
+                wanting = select(missing * missing < ACHIEVED, 0.0, 1.0)
+                x[_POSITIVE, j] = select(missing > FLT_EPSILON, wanting, 0.0)
+                x[_NEGATIVE, j] = select(missing < -FLT_EPSILON, wanting, 0.0)
+        acting = t - delay_ticks
+        for j in range(LANES):
+            u = out[2, acting, j] if acting >= 0 else 0.0
+            v, p, phi, m = x[_V, j], x[_P, j], x[_PHI, j], x[_M, j]
+            e = select(linear, 0.0, gravity_excess(phi))
+            v1 = lateral_row(matrices[0, 0, j], matrices[0, 1, j], matrices[0, 2, j], matrices[0, 3, j],
+                             matrices[0, 4, j], matrices[0, 5, j], v, p, phi, m, u, e)  # fmt: skip
+            p1 = lateral_row(matrices[1, 0, j], matrices[1, 1, j], matrices[1, 2, j], matrices[1, 3, j],
+                             matrices[1, 4, j], matrices[1, 5, j], v, p, phi, m, u, e)  # fmt: skip
+            phi1 = lateral_row(matrices[2, 0, j], matrices[2, 1, j], matrices[2, 2, j], matrices[2, 3, j],
+                               matrices[2, 4, j], matrices[2, 5, j], v, p, phi, m, u, e)  # fmt: skip
+            m1 = lateral_row(matrices[3, 0, j], matrices[3, 1, j], matrices[3, 2, j], matrices[3, 3, j],
+                             matrices[3, 4, j], matrices[3, 5, j], v, p, phi, m, u, e)  # fmt: skip
+            # a motion that is no number any more is lost too: it is not within
+            flies = select(abs(phi1) <= LOST_RAD, x[_FLIES, j], 0.0)
+            x[_FLIES, j] = flies
+            x[_V, j] = select(flies != 0.0, v1, v)
+            x[_P, j] = select(flies != 0.0, p1, p)
+            x[_PHI, j] = select(flies != 0.0, phi1, phi)
+            x[_M, j] = select(flies != 0.0, m1, m)
+    for j in range(LANES):
+        lost[j] = x[_FLIES, j] == 0.0
+
+
+class Batch:
+    """A job, prepared: `blocks` may be flown in any order and by several threads at once.
+
+    Args:
+        job: what is flown.
+        compiled: True or False to choose how; None lets the size of the job and the machine decide.
+
+    Raises:
+        UsageError: a gain set's settings have what the batch cannot fly.
+    """
+
+    def __init__(self, job: RollJob, compiled: bool | None = None) -> None:
+        self.job = job
+        self.compiled = is_compiled(fly_lanes) or job.steps > COMPILE_STEPS if compiled is None else compiled
+        dt_s = float(job.settings["dt_s"][0])
+        self.torques = [roll_torque(one, job.hover_thrust) for one in job.settings]
+        matrices = step_matrices(job.derivatives, job.motor_lag_s, dt_s)
+        self.width = LANES if self.compiled else _ARRAY_WIDTH
+        firsts = range(0, len(matrices), self.width)
+        self._matrices = {first: self._lanes(matrices[first : first + self.width]) for first in firsts}
+        self.blocks = [(g, first) for g in range(len(job.settings)) for first in firsts]
+
+    def _lanes(self, matrices: FloatArray) -> FloatArray:
+        """(4, 6, lanes): the last block is filled up with its own last sample."""
+        if self.compiled:
+            missing = self.width - len(matrices)
+            matrices = np.concatenate([matrices, np.repeat(matrices[-1:], missing, axis=0)])
+        return np.ascontiguousarray(np.moveaxis(matrices, 0, 2))
+
+    def fly(self, gain_set: int, first: int) -> Block:
+        """Fly one of `blocks`."""
+        job, torque = self.job, self.torques[gain_set]
+        matrices = self._matrices[first]
+        lanes, count = matrices.shape[2], min(self.width, len(job.derivatives) - first)
+        out = np.empty((3, len(job.phi_sp_rad), lanes))
+        lost = np.zeros(lanes, dtype=bool)
+        settings = job.settings[gain_set : gain_set + 1]
+        if self.compiled:
+            fly_lanes(
+                settings, matrices, job.phi_sp_rad, job.delay_ticks, torque.limit, torque.clips, torque.most,
+                torque.given, torque.delta, out, lost,
+            )  # fmt: skip
+        else:
+            _fly_arrays(settings[0], matrices, job, torque, out, lost)
+        return Block(gain_set, first, out[0, :, :count], out[1, :, :count], out[2, :, :count], lost[:count])
+
+
+_ARRAY_WIDTH = 1024
+
+
+def _fly_arrays(
+    s: Record,
+    matrices: FloatArray,
+    job: RollJob,
+    torque_of: RollTorque,
+    out: FloatArray,
+    lost: BoolArray,
+) -> None:
+    """`fly_lanes` with numpy: the order of things is the same, the laws are the same lines."""
+    law, excess, biquad_of = array_form(roll_law), array_form(gravity_excess), array_form(biquad_step)
+    phi_out, p_out, delta_out = out
+    n = out.shape[2]
+    x = np.zeros((4, n))
+    y, accel, delay0, delay1, integral, rate_sp = (np.zeros(n) for _ in range(6))
+    notch = np.zeros((2, 2, n))
+    positive = negative = np.zeros(n, dtype=bool)
+    table = np.linspace(-torque_of.most, torque_of.most, len(torque_of.given)) if not torque_of.clips else None
+    whole = int(s["attitude_late_ticks"])
+    part = float(s["attitude_late_ticks"]) - whole
+    fixed = (
+        *(float(c) for c in s["low_pass"]), float(s["dgyro_alpha"]), float(s["dt_s"]),
+        float(s["att_gain"][0]), float(s["rate_max"][0]),
+        *(float(s[name][0]) for name in ("k", "kp", "ki", "kd", "kff", "int_lim")),
+        bool(s["linear"]), bool(s["rate_sp_late"]),
+    )  # fmt: skip
+    level = np.zeros(n)
+    for t, wanted in enumerate(job.phi_sp_rad.tolist()):
+        phi_out[t], p_out[t] = x[2], x[1]
+        seen = phi_out[t - whole] if t >= whole else level
+        if part:
+            seen = (1.0 - part) * seen + part * (phi_out[t - whole - 1] if t > whole else level)
+        measured = x[1]
+        for i in range(int(s["notch_count"])):
+            measured, w = biquad_of(*s["notches"][i], notch[i, 0], notch[i, 1], measured)
+            notch[i, 1], notch[i, 0] = notch[i, 0], w
+        torque, y, accel, w, integral, rate_sp = law(
+            measured, seen, wanted, y, accel, delay0, delay1, integral, rate_sp, positive, negative, *fixed
+        )
+        delay1, delay0 = delay0, w
+        if table is None:
+            given = np.clip(torque, -torque_of.limit, torque_of.limit)
+            delta_out[t] = given
+        else:
+            given = np.interp(torque, table, torque_of.given)
+            delta_out[t] = np.interp(torque, table, torque_of.delta)
+        if s["limits"] and (t + 1) % int(s["status_ticks"]) == 0:
+            missing = torque - given
+            wanting = missing * missing >= ACHIEVED
+            positive, negative = wanting & (missing > FLT_EPSILON), wanting & (missing < -FLT_EPSILON)
+        u = delta_out[t - job.delay_ticks] if t >= job.delay_ticks else level
+        e = level if s["linear"] else excess(x[2])
+        moved = np.einsum("ikn,kn->in", matrices, np.stack([*x, u, e]))
+        lost |= ~(np.abs(moved[2]) <= LOST_RAD)
+        x = np.where(lost, x, moved)
