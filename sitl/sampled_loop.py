@@ -16,6 +16,7 @@ in ticks, T a further one in seconds that need not be whole ticks; both enter ex
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,8 +24,8 @@ import numpy.typing as npt
 
 from sitl.airframe import Derivatives, FlightGains
 from sitl.filters import PASS_THROUGH, alpha_of, low_pass_2p
-from sitl.lateral import LateralModel
 from sitl.profile import Profile
+from sitl.roll_loop import step_matrices
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -51,10 +52,11 @@ class RollGains:
 
 
 class SampledLoop:
-    """The sampled roll loop of one model, one gain set and one profile.
+    """The sampled roll loop of one gain set and one profile, on one model or on many at once.
 
     Args:
-        derivatives: the lateral model.
+        derivatives: the lateral model, or an array (S, 6) of samples in the order of DERIVATIVE_NAMES; everything
+            that depends on the model then has S as its first dimension.
         gains: of the roll axis.
         profile: rate, delays and filters; its `motor_lag_s` is not used.
         motor_lag_s: time constant of the motors, 0 for none.
@@ -66,7 +68,7 @@ class SampledLoop:
 
     def __init__(
         self,
-        derivatives: Derivatives,
+        derivatives: Derivatives | FloatArray,
         gains: RollGains,
         profile: Profile,
         motor_lag_s: float,
@@ -85,14 +87,36 @@ class SampledLoop:
         whole = math.floor(transport_delay_s / dt + 1e-9)
         fraction_s = max(0.0, transport_delay_s - whole * dt)
         self.delay_ticks = profile.transport_delay_ticks + whole
-        self.phi, self.held, self.previous = _discretise(derivatives, motor_lag_s, dt, fraction_s)
+        rows = derivatives.as_array() if isinstance(derivatives, Derivatives) else np.asarray(derivatives)
+        self.phi, self.held, self.previous = _discretise(rows, motor_lag_s, dt, fraction_s)
+        self._den, self._num = _rational(self.phi, (self.held, self.previous))
         self.delay_s = self.delay_ticks * dt + fraction_s + dt / 2.0 + motor_lag_s + _low_pass_delay(profile)
         """Delay at low frequency of the rate loop's own elements: transport, half a tick of hold, motor lag,
         gyro filter. The attitude's lateness and the D filter are not in it: they delay part of the signal."""
 
+    def with_gains(self, gains: RollGains) -> SampledLoop:
+        """The same models and profile with other gains."""
+        other = copy(self)
+        other.gains = gains
+        return other
+
+    def as_samples(self) -> SampledLoop:
+        """The loop of one model as one of one sample."""
+        other = copy(self)
+        other.phi, other.held, other.previous = self.phi[None], self.held[None], self.previous[None]
+        other._den, other._num = self._den[None], self._num[:, :, None]
+        return other
+
+    def sample(self, row: int | slice | npt.NDArray[np.intp]) -> SampledLoop:
+        """The loop of one of the samples, or of some."""
+        other = copy(self)
+        other.phi, other.held, other.previous = self.phi[row], self.held[row], self.previous[row]
+        other._den, other._num = self._den[row], self._num[:, :, row]
+        return other
+
     @property
     def finite_at_zero(self) -> bool:
-        """Whether L has a value at frequency 0: no integrator, no pole of the airframe at rest (Lv = 0)."""
+        """Whether L has a value at frequency 0: no integrator, no pole of an airframe at rest (Lv = 0)."""
         at_rest = np.abs(np.linalg.eigvals(self.phi) - 1.0).min() < 1e-12
         return self.gains.k * self.gains.ki == 0.0 and not bool(at_rest)
 
@@ -103,39 +127,75 @@ class SampledLoop:
             omega_rad_s: any shape, in [0, pi/dt]; 0 only if `finite_at_zero`.
 
         Returns:
-            The same shape.
+            The same shape, behind S if the loop holds samples.
         """
         omega = np.asarray(omega_rad_s, dtype=float)
-        z = np.exp(1j * omega * self.dt_s)
-        lag = 1.0 / z
+        p, phi = self.plant(omega.ravel())
+        on_p, on_phi = self.controller(omega.ravel())
+        loop: ComplexArray = on_p * p + on_phi * phi
+        return loop.reshape((*loop.shape[:-1], *omega.shape))
+
+    def plant(
+        self, omega_rad_s: FloatArray, rows: npt.NDArray[np.intp] | None = None
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Roll rate and roll angle per command, from the motors' side of the cut to the sensors.
+
+        Args:
+            omega_rad_s: (F,). rows: (F,) the sample that each frequency belongs to; None for all of them.
+
+        Returns:
+            two arrays (F,), behind S if the loop holds samples and `rows` is None.
+        """
+        half = 0.5 * omega_rad_s * self.dt_s
+        w = 2j * np.sin(half) * np.exp(1j * half)  # z - 1 without the cancellation near z = 1
+        lag = np.exp(-2j * half)
+        den, num = self._den, self._num
+        if rows is not None:
+            den, num = den[rows], num[:, :, rows]
+        elif den.ndim == 2:
+            den, num = den[:, None, :], num[:, :, :, None, :]
+        both = []
+        shift = lag**self.delay_ticks / _horner(den, w)
+        for signal in (0, 1):
+            value = _horner(num[0, signal], w)
+            if np.any(self.previous):
+                value = value + _horner(num[1, signal], w) * lag
+            both.append(value * shift)
+        return both[0], both[1]
+
+    def controller(self, omega_rad_s: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        """What multiplies roll rate and roll angle in L: filters and gains.
+
+        Args:
+            omega_rad_s: (F,).
+        """
+        half = 0.5 * omega_rad_s * self.dt_s
+        w = 2j * np.sin(half) * np.exp(1j * half)
+        lag = np.exp(-2j * half)
         g = self.gains
-
-        resolvent = z[..., None, None] * np.eye(len(self.phi)) - self.phi
-        forcing = (self.held + self.previous * lag[..., None]) * lag[..., None] ** self.delay_ticks
-        plant = np.linalg.solve(resolvent, forcing[..., None])[..., 0]
-
         b0, b1, b2, a1, a2 = self.biquad
         gyro = (b0 + (b1 + b2 * lag) * lag) / (1.0 + (a1 + a2 * lag) * lag)
         a = self.dgyro_alpha
-        slope = (1.0 - lag) / self.dt_s * a / (1.0 - (1.0 - a) * lag)
-        error = g.k * g.kp + (g.k * g.ki * self.dt_s / (z - 1.0) if g.k * g.ki else 0.0)
+        slope = w * lag / self.dt_s * a / (1.0 - (1.0 - a) * lag)
+        error = g.k * g.kp + (g.k * g.ki * self.dt_s / w if g.k * g.ki else 0.0)
         attitude = g.k_phi * np.polynomial.polynomial.polyval(lag, self.late)
-        loop: ComplexArray = (error + g.k * g.kd * slope) * gyro * plant[..., P] + (error + g.kff) * attitude * plant[
-            ..., PHI
-        ]
-        return loop
+        return (error + g.k * g.kd * slope) * gyro, (error + g.kff) * attitude
 
-    def closed_loop_matrix(self, loop_gain: float = 1.0) -> FloatArray:
+    def closed_loop_matrix(self, loop_gain: float | FloatArray = 1.0) -> FloatArray:
         """One tick of the whole closed loop: state_k+1 = M state_k, without set-point.
 
         The state is the plant's x_k (v, p, phi and, with lag, the motor), then as far as they exist: commands
         u_k-1, u_k-2, ...; the gyro filter's two; y_k-1; alpha_k-1; I_k; angles phi_k-1, phi_k-2, ...
 
         Args:
-            loop_gain: factor on delta_lat where the loop is cut.
+            loop_gain: factor on delta_lat where the loop is cut; (S,) for a factor of each sample.
+
+        Returns:
+            (N, N), behind S if the loop holds samples.
         """
         g = self.gains
-        n = len(self.phi)
+        n = self.phi.shape[-1]
+        lead = self.phi.shape[:-2]
         commands = self.delay_ticks + (1 if np.any(self.previous) else 0)
         filtered = self.biquad != PASS_THROUGH
         integrates = g.k * g.ki != 0.0
@@ -158,29 +218,61 @@ class SampledLoop:
         )
         integral = unit[integral_at] if integrates else np.zeros(size)
         delta = g.k * g.kp * (rate_sp - y) + integral - g.k * g.kd * alpha + g.kff * rate_sp
-        u = [loop_gain * delta, *(unit[command_at + i] for i in range(commands))]
+        now = np.broadcast_to(np.asarray(loop_gain)[..., None] * delta, (*lead, size))
+        u = [now, *(unit[command_at + i] for i in range(commands))]
 
-        rows = np.zeros((size, size))
-        rows[:n, :n] = self.phi
-        rows[:n] += np.outer(self.held, u[self.delay_ticks])
+        rows = np.zeros((*lead, size, size))
+        rows[..., :n, :n] = self.phi
+        rows[..., :n, :] += self.held[..., :, None] * u[self.delay_ticks][..., None, :]
         if np.any(self.previous):
-            rows[:n] += np.outer(self.previous, u[self.delay_ticks + 1])
+            rows[..., :n, :] += self.previous[..., :, None] * u[self.delay_ticks + 1][..., None, :]
         for i in range(commands):
-            rows[command_at + i] = u[i]
+            rows[..., command_at + i, :] = u[i]
         if filtered:  # transposed direct form II
-            rows[filter_at] = b1 * p - a1 * y + unit[filter_at + 1]
-            rows[filter_at + 1] = b2 * p - a2 * y
-        rows[y_at], rows[y_at + 1] = y, alpha
+            rows[..., filter_at, :] = b1 * p - a1 * y + unit[filter_at + 1]
+            rows[..., filter_at + 1, :] = b2 * p - a2 * y
+        rows[..., y_at, :], rows[..., y_at + 1, :] = y, alpha
         if integrates:
-            rows[integral_at] = integral + g.k * g.ki * self.dt_s * (rate_sp - y)
+            rows[..., integral_at, :] = integral + g.k * g.ki * self.dt_s * (rate_sp - y)
         for i in range(angles):
-            rows[angle_at + i] = phi if i == 0 else unit[angle_at + i - 1]
+            rows[..., angle_at + i, :] = phi if i == 0 else unit[angle_at + i - 1]
         return rows
 
-    def eigenvalues(self, loop_gain: float = 1.0) -> ComplexArray:
+    def eigenvalues(self, loop_gain: float | FloatArray = 1.0) -> ComplexArray:
         """Eigenvalues of one tick of the closed loop; stable if all lie inside the unit circle."""
         values: ComplexArray = np.linalg.eigvals(self.closed_loop_matrix(loop_gain)).astype(complex)
         return values
+
+
+def _horner(coefficients: FloatArray, w: ComplexArray) -> ComplexArray:
+    """Polynomial with the highest power first in the last dimension, at w."""
+    value = coefficients[..., 0] + np.zeros_like(w)
+    for k in range(1, coefficients.shape[-1]):
+        value *= w
+        value += coefficients[..., k]
+    return value
+
+
+def _rational(phi: FloatArray, inputs: tuple[FloatArray, ...]) -> tuple[FloatArray, FloatArray]:
+    """Denominator and numerators of (wI - (phi - I))^-1 b by Faddeev and LeVerrier, w = z - 1, highest power first.
+
+    In w instead of z nothing cancels where it matters: slow poles lie near z = 1.
+
+    Returns:
+        (..., n + 1) and (inputs, signals p and phi, ..., n).
+    """
+    n = phi.shape[-1]
+    unit = np.eye(n)
+    a = phi - unit
+    den, num = [np.ones(phi.shape[:-2])], []
+    m = np.broadcast_to(unit, phi.shape)
+    for k in range(1, n + 1):
+        num.append([[(m[..., signal, :] * b).sum(axis=-1) for signal in (P, PHI)] for b in inputs])
+        moved = a @ m
+        c = -np.trace(moved, axis1=-2, axis2=-1) / k
+        den.append(c)
+        m = moved + c[..., None, None] * unit
+    return np.stack(den, axis=-1), np.moveaxis(np.array(num), 0, -1)
 
 
 def _late_weights(profile: Profile) -> FloatArray:
@@ -201,23 +293,19 @@ def _low_pass_delay(profile: Profile) -> float:
 
 
 def _discretise(
-    derivatives: Derivatives, motor_lag_s: float, dt: float, late_s: float
+    derivatives: FloatArray, motor_lag_s: float, dt: float, late_s: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(Phi, held, previous) of x_k+1 = Phi x_k + held u_k + previous u_k-1: exact for a held input.
 
     The input of tick k arrives `late_s` after the tick begins; until then the one before acts.
     """
-    import scipy.linalg  # slow to import, and only an analysis needs it
-
-    model = LateralModel.from_derivatives(derivatives)
     n = 4 if motor_lag_s > 0.0 else 3
-    generator = np.zeros((n + 1, n + 1))  # of [x, u] with u' = 0
-    generator[:3, :3] = model.A
-    generator[:3, 3] = model.B[:, 0]
-    if motor_lag_s > 0.0:
-        generator[3, 3:] = -1.0 / motor_lag_s, 1.0 / motor_lag_s
-    rest: FloatArray = scipy.linalg.expm(generator * (dt - late_s))
-    if late_s == 0.0:
-        return rest[:n, :n], rest[:n, n], np.zeros(n)
-    first: FloatArray = scipy.linalg.expm(generator * late_s)
-    return rest[:n, :n] @ first[:n, :n], rest[:n, n], rest[:n, :n] @ first[:n, n]
+    rows = derivatives.reshape(-1, 6)
+    shape = derivatives.shape[:-1]
+    rest = step_matrices(rows, motor_lag_s, dt - late_s)
+    phi, held = rest[:, :n, :n], rest[:, :n, 4]
+    previous = np.zeros_like(held)
+    if late_s > 0.0:
+        first = step_matrices(rows, motor_lag_s, late_s)
+        phi, previous = phi @ first[:, :n, :n], (phi @ first[:, :n, 4, None])[..., 0]
+    return phi.reshape(*shape, n, n), held.reshape(*shape, n), previous.reshape(*shape, n)

@@ -1,0 +1,315 @@
+"""A Monte Carlo without a flight: every gain set on every sample of an uncertain model, measured as flights are.
+
+The roll axis is flown by `sitl.batch` with the laws that fly live; what is measured, and how segments become the
+value of the whole, is what `scenarios.score` does with telemetry. NaN stands for UNSET.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from scenarios import batch_metrics as lanes
+from scenarios.manoeuvres import EPSILON_S, Manoeuvre, Window
+from scenarios.metrics import effort_metrics, oscillation, step_metrics, track_metrics
+from scenarios.roll_set import RollSet, roll_sets
+from sitl.batch import Batch, Block, RollJob
+from sitl.errors import UsageError
+from sitl.profile import Profile
+from sitl.sampled_loop import RollGains
+from sitl.uncertainty import Distribution, sample_derivatives
+from sitl.vehicle_spec import VehicleModel
+
+if TYPE_CHECKING:
+    from sitl.margin_batch import MarginArrays
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+MAX_SAMPLES = 1_000_000
+TRACES_BYTES = 4e9
+"""Traces that would not fit into this are refused."""
+
+SETPOINT_RATE_HZ = 50.0
+"""What a scenario sends its set-points at unless it says otherwise."""
+
+LOWEST_IS_WORST = ("vaf_pct", "vaf_lag_removed_pct")
+LARGEST_MAGNITUDE_IS_WORST = ("droop_deg",)
+
+
+@dataclass(frozen=True)
+class Traces:
+    """What was flown, of every gain set and sample.
+
+    Attributes:
+        t_s: (T,) from the start of the first manoeuvre.
+        phi_sp_rad: (T,) roll set-point.
+        phi_rad, delta_lat, p_rad_s: (G, S, T).
+    """
+
+    t_s: FloatArray
+    phi_sp_rad: FloatArray
+    phi_rad: FloatArray
+    delta_lat: FloatArray
+    p_rad_s: FloatArray
+
+
+@dataclass(frozen=True)
+class MonteCarlo:
+    """Every gain set on every sample.
+
+    Attributes:
+        names: of the G gain sets.
+        derivatives: (S, 6); row 0 is the nominal model.
+        metrics: name of `scenarios.limits.METRICS` -> (G, S); NaN is UNSET.
+        margins: of the loop, each (G, S); None if not asked for.
+        diverged: (G, S) the roll angle passed 80 degrees.
+        traces: None if not asked for.
+    """
+
+    names: tuple[str, ...]
+    derivatives: FloatArray
+    metrics: Mapping[str, FloatArray]
+    margins: MarginArrays | None
+    diverged: BoolArray
+    traces: Traces | None = None
+
+
+def draw_samples(
+    model: VehicleModel,
+    samples: int,
+    seed: int,
+    distribution: Distribution = "gaussian",
+    spread_sigma: float = 3.0,
+) -> FloatArray:
+    """The nominal derivatives and then random ones: (samples + 1, 6).
+
+    Args:
+        model: nominal values and sigma. samples: number of random ones, 0 for none.
+        seed: of the draw. distribution, spread_sigma: as `sample_derivatives`.
+
+    Raises:
+        UsageError: a number that is not usable.
+    """
+    if not 0 <= samples <= MAX_SAMPLES:
+        raise UsageError(f"samples = {samples}: give 0 to {MAX_SAMPLES}")
+    nominal = model.derivatives.as_array()[None, :]
+    if not samples:
+        return nominal
+    rng = np.random.default_rng(seed)
+    drawn = sample_derivatives(model.derivatives, model.sigma_pct, samples, rng, spread_sigma, distribution)
+    return np.concatenate([nominal, drawn])
+
+
+def monte_carlo(
+    model: VehicleModel,
+    gains: Mapping[str, RollGains | RollSet],
+    profile: Profile,
+    manoeuvres: Sequence[Manoeuvre],
+    *,
+    samples: int = 500,
+    seed: int = 1,
+    distribution: Distribution = "gaussian",
+    spread_sigma: float = 3.0,
+    derivatives: FloatArray | None = None,
+    keep_traces: bool = False,
+    margins: bool = True,
+    setpoint_rate_hz: float = SETPOINT_RATE_HZ,
+    threads: int | None = None,
+    compiled: bool | None = None,
+) -> MonteCarlo:
+    """Fly every gain set on the nominal model and on samples of it.
+
+    Args:
+        model: what flies, with its uncertainty. gains: name -> gains, or a whole set. profile: fidelity.
+        manoeuvres: each from level flight, without wind or noise.
+        samples, seed, distribution, spread_sigma: of the random models beside the nominal one.
+        derivatives: (S, 6) to fly instead of drawing.
+        keep_traces: keep what was flown. margins: work out the loop's margins too.
+        setpoint_rate_hz: set-points are held in between. threads: None takes all cores.
+        compiled: as `sitl.batch.Batch`.
+
+    Returns:
+        the same numbers whatever the number of threads.
+
+    Raises:
+        UsageError: no gain set or manoeuvre, samples that are not finite, traces too large.
+    """
+    if not gains or not manoeuvres:
+        raise UsageError("a Monte Carlo needs at least one gain set and one manoeuvre")
+    plain = {name: one for name, one in gains.items() if isinstance(one, RollGains)}
+    made = dict(zip(plain, roll_sets(model, profile, list(plain.values())), strict=True))
+    sets = [one if isinstance(one, RollSet) else made[name] for name, one in gains.items()]
+    if derivatives is None:
+        derivatives = draw_samples(model, samples, seed, distribution, spread_sigma)
+    lag_s = profile.motor_lag(model.assumptions.motor_lag_s)
+    signals = [_ticks(manoeuvre, profile, setpoint_rate_hz) for manoeuvre in manoeuvres]
+    length = sum(len(signal) for signal in signals)
+    if keep_traces and 24.0 * len(sets) * len(derivatives) * length > TRACES_BYTES:
+        raise UsageError(
+            f"the traces of {len(sets)} gain sets x {len(derivatives)} samples x {length} ticks would fill "
+            f"{24.0 * len(sets) * len(derivatives) * length / 1e9:.0f} GB: keep fewer, or none"
+        )
+    worst = _Worst(len(sets), len(derivatives))
+    kept = np.empty((3, len(sets), len(derivatives), length)) if keep_traces else None
+    settings = np.array([one.settings for one in sets])
+    workers = threads or os.cpu_count() or 1
+    with ThreadPoolExecutor(workers) as pool:
+        found = pool.submit(_margins, derivatives, sets, lag_s) if margins else None
+        at = 0
+        for manoeuvre, signal in zip(manoeuvres, signals, strict=True):
+            job = RollJob(
+                settings, derivatives, lag_s, profile.transport_delay_ticks, model.assumptions.hover_thrust, signal
+            )
+            for block, values in _fly(Batch(job, compiled), manoeuvre, signal, profile.dt_s, pool, workers):
+                worst.add(block, values)
+                if kept is not None:
+                    place = (slice(block.first, block.first + len(block.lost)), slice(at, at + len(signal)))
+                    for i, trace in enumerate((block.phi_rad, block.delta_lat, block.p_rad_s)):
+                        kept[i, block.gain_set][place] = trace.T
+            at += len(signal)
+        margin_arrays = found.result() if found is not None else None
+    traces = None
+    if kept is not None:
+        traces = Traces(np.arange(length) / profile.rate_hz, np.concatenate(signals), *kept)
+    return MonteCarlo(tuple(gains), derivatives, worst.metrics(), margin_arrays, worst.diverged, traces)
+
+
+def _ticks(manoeuvre: Manoeuvre, profile: Profile, setpoint_rate_hz: float) -> FloatArray:
+    """Roll set-point of every tick: sent at its own rate and held."""
+    sent = manoeuvre.samples(setpoint_rate_hz)
+    ticks = np.arange(round(manoeuvre.duration_s * profile.rate_hz))
+    held = np.floor(ticks / profile.rate_hz * setpoint_rate_hz + EPSILON_S * setpoint_rate_hz).astype(int)
+    return np.asarray(sent[np.minimum(held, len(sent) - 1)])
+
+
+def _margins(derivatives: FloatArray, sets: Sequence[RollSet], lag_s: float) -> MarginArrays:
+    """Margins of every set, those that share their filters together."""
+    from dataclasses import fields
+
+    from sitl.margin_batch import MarginArrays, batch_margins
+
+    rows: dict[int, MarginArrays] = {}
+    profiles = list(dict.fromkeys(one.profile for one in sets))
+    for profile in profiles:
+        members = [g for g, one in enumerate(sets) if one.profile == profile]
+        found = batch_margins(derivatives, [sets[g].gains for g in members], profile, lag_s)
+        if len(profiles) == 1:
+            return found
+        for row, g in enumerate(members):
+            rows[g] = MarginArrays(**{f.name: getattr(found, f.name)[row] for f in fields(found)})
+    return MarginArrays(
+        **{f.name: np.stack([getattr(rows[g], f.name) for g in range(len(sets))]) for f in fields(MarginArrays)}
+    )
+
+
+Values = list[tuple[Window, Mapping[str, FloatArray]]]
+"""Of one block: each window of the manoeuvre with its metrics, (n,) each."""
+
+
+def _fly(
+    batch: Batch, manoeuvre: Manoeuvre, signal: FloatArray, dt_s: float, pool: ThreadPoolExecutor, workers: int
+) -> Iterator[tuple[Block, Values]]:
+    """Blocks in order, a few ahead of the reader at a time: memory does not grow with the job."""
+
+    def one(gain_set: int, first: int) -> tuple[Block, Values]:
+        block = batch.fly(gain_set, first)
+        measure = _measure_lanes if batch.compiled else _measure_each
+        values = [(window, measure(block, window, signal, dt_s)) for window in manoeuvre.windows]
+        return block, values
+
+    ahead = 2 * workers
+    waiting = [pool.submit(one, *place) for place in batch.blocks[:ahead]]
+    for n in range(len(batch.blocks)):
+        done = waiting.pop(0).result()
+        if n + ahead < len(batch.blocks):
+            waiting.append(pool.submit(one, *batch.blocks[n + ahead]))
+        yield done
+
+
+def _rows(window: Window, dt_s: float) -> slice:
+    return slice(round(window.start_s / dt_s), round(window.end_s / dt_s))
+
+
+def _measure_lanes(block: Block, window: Window, signal: FloatArray, dt_s: float) -> Mapping[str, FloatArray]:
+    rows = _rows(window, dt_s)
+    phi = block.phi_rad[rows]
+    found: dict[str, FloatArray] = {}
+    if window.kind == "step":
+        steps = lanes.measure_step(phi, dt_s, window.phi_from_rad, window.phi_to_rad)
+        found |= dict(zip(lanes.STEP, steps, strict=True))
+    elif window.kind == "track":
+        found |= dict(zip(lanes.TRACK, lanes.measure_track(phi, signal[rows], dt_s), strict=True))
+    if window.kind in ("step", "hold"):
+        found["oscillation_rad_s"] = lanes.measure_oscillation(block.p_rad_s[rows], dt_s)
+    return found | dict(zip(lanes.EFFORT, lanes.measure_effort(block.delta_lat[rows]), strict=True))
+
+
+def _measure_each(block: Block, window: Window, signal: FloatArray, dt_s: float) -> Mapping[str, FloatArray]:
+    """The same by `scenarios.metrics`, one flight after the other: nothing to compile."""
+    rows = _rows(window, dt_s)
+    t = np.arange(rows.start, rows.stop) * dt_s
+    start, end = window.start_s, window.end_s
+    level = np.zeros(len(t))
+    found: dict[str, FloatArray] = {}
+    for j in range(len(block.lost)):
+        phi = block.phi_rad[rows, j]
+        metrics = effort_metrics(t, block.delta_lat[rows, j], start_s=start, end_s=end)
+        if window.kind == "step":
+            before, after = window.phi_from_rad, window.phi_to_rad
+            metrics += step_metrics(t, phi, start_s=start, end_s=end, phi_from_rad=before, phi_to_rad=after)
+        elif window.kind == "track":
+            metrics += track_metrics(t, phi, signal[rows], start_s=start, end_s=end)
+        for metric in metrics:
+            row = found.setdefault(metric.name, np.full(len(block.lost), math.nan))
+            row[j] = math.nan if metric.value is None else metric.value
+        if window.kind in ("step", "hold"):
+            shake = oscillation(t, block.p_rad_s[rows, j], level, level, start_s=start, end_s=end)
+            found.setdefault("oscillation_rad_s", np.full(len(block.lost), math.nan))[j] = shake.worst_rad_s
+    return found
+
+
+class _Worst:
+    """The whole's value of each metric: that of its worst segment; NaN if any segment has none."""
+
+    def __init__(self, sets: int, samples: int) -> None:
+        self._values: dict[str, FloatArray] = {}
+        self._shape = (sets, samples)
+        self.diverged: BoolArray = np.zeros(self._shape, dtype=bool)
+
+    def add(self, block: Block, values: Values) -> None:
+        place = block.gain_set, slice(block.first, block.first + len(block.lost))
+        self.diverged[place] |= block.lost
+        for _, metrics in values:
+            for name, value in metrics.items():
+                if name not in self._values:
+                    self._values[name] = np.full(self._shape, -math.inf)
+                self._values[name][place] = _worse(name, self._values[name][place], value)
+
+    def metrics(self) -> dict[str, FloatArray]:
+        cycles = lanes.is_limit_cycle(self._values.get("oscillation_rad_s", np.full(self._shape, math.nan)))
+        found = {}
+        for name, value in self._values.items():
+            unset = self.diverged | ~np.isfinite(value)
+            if name in lanes.STEP[:4]:
+                unset |= cycles
+            found[name] = np.where(unset, math.nan, value)
+        return found
+
+
+def _worse(name: str, held: FloatArray, new: FloatArray) -> FloatArray:
+    """The worse of two segments' values; `held` is -inf before the first. A window too short to tell is passed over."""
+    if name == "oscillation_rad_s":
+        return np.fmax(held, new)
+    if name in LOWEST_IS_WORST:
+        return np.where(np.isneginf(held), new, np.minimum(held, new))
+    if name in LARGEST_MAGNITUDE_IS_WORST:
+        return np.where(np.isneginf(held) | (np.abs(new) > np.abs(held)) | np.isnan(new), new, held)
+    return np.maximum(held, new)

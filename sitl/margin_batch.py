@@ -1,0 +1,254 @@
+"""Margins of the roll loop over gain sets x samples, cut at delta_lat.
+
+The airframe is unstable by itself, so the loop is conditionally stable: too little gain loses it as well as too much,
+and both limits are reported. In a sampled loop the upper one often lies at z = -1, half the tick rate. Whether a loop
+is stable at all is decided by eigenvalues, never by the shape of L.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from sitl.airframe import DERIVATIVE_NAMES
+from sitl.crossings import Crossings, IndexArray, Loop, least_of
+from sitl.errors import UsageError
+from sitl.profile import Profile
+from sitl.sampled_loop import ComplexArray, FloatArray, RollGains, SampledLoop
+
+# Lowest frequency looked at: below the slowest integrator crossover of any gain worth flying.
+OMEGA_MIN_RAD_S = 1e-4
+
+
+@dataclass(frozen=True)
+class MarginArrays:
+    """Margins of many loops: every field an array of one shape, (gain sets, samples) from `batch_margins`.
+
+    The meaning of each is that of the same field of `sitl.stability.Margins`; NaN stands for its None.
+    """
+
+    closed_loop_stable: npt.NDArray[np.bool_]
+    gain_margin_low_db: FloatArray
+    gain_margin_high_db: FloatArray
+    phase_margin_deg: FloatArray
+    delay_margin_s: FloatArray
+    modulus_margin: FloatArray
+    sensitivity_peak: FloatArray
+    """Largest |1 / (1 + L)|: the inverse of the modulus margin."""
+    complementary_peak: FloatArray
+    """Largest |L / (1 + L)|."""
+    crossover_rad_s: FloatArray
+    phase_crossover_rad_s: FloatArray
+
+
+class Sampled:
+    """`SampledLoop` of S samples as a `Loop`."""
+
+    def __init__(self, loop: SampledLoop) -> None:
+        self.loop = loop
+        self.delay_s = loop.delay_s
+
+    def grid(self) -> FloatArray:
+        """See `Loop`."""
+        loop = self.loop
+        top = math.pi / loop.dt_s * (1.0 - 1e-6)
+        slow = np.geomspace(OMEGA_MIN_RAD_S, 0.5, 60, endpoint=False)
+        fast = np.geomspace(0.5, top, 300)
+        turning_s = loop.delay_s - loop.motor_lag_s + 2.0 * loop.dt_s  # a lag turns L by 90 degrees in all
+        even = np.linspace(0.5, top, math.ceil(top * turning_s / 0.15))
+        return np.unique(np.concatenate([slow, fast, even]))
+
+    def values(self, omega: FloatArray, rows: IndexArray) -> ComplexArray:
+        """See `Loop`."""
+        p, phi = self.loop.plant(omega, rows)
+        on_p, on_phi = self.loop.controller(omega)
+        return on_p * p + on_phi * phi
+
+    def table(self, omega: FloatArray, rows: slice) -> ComplexArray:
+        """See `Loop`."""
+        return self.loop.sample(rows).transfer(omega)
+
+    def real_at(self) -> tuple[float, ...]:
+        """See `Loop`."""
+        half_rate = math.pi / self.loop.dt_s
+        return (half_rate, 0.0) if self.loop.finite_at_zero else (half_rate,)
+
+    def unstable(self, rows: IndexArray, gains: FloatArray) -> IndexArray:
+        """See `Loop`."""
+        values = np.abs(self.loop.sample(rows).eigenvalues(gains))
+        return np.asarray(np.count_nonzero(values >= 1.0, axis=-1))
+
+
+def batch_margins(
+    derivatives: FloatArray,
+    gains: Sequence[RollGains],
+    profile: Profile,
+    motor_lag_s: float,
+    transport_delay_s: float = 0.0,
+) -> MarginArrays:
+    """Margins of the sampled loop of every gain set on every sample.
+
+    Args:
+        derivatives: (S, 6) in the order of DERIVATIVE_NAMES. gains: G sets.
+        profile: rate, filters, delays. motor_lag_s: of the motors, 0 for none.
+        transport_delay_s: further delay, beyond the profile's ticks.
+
+    Returns:
+        arrays (G, S).
+
+    Raises:
+        UsageError: no sample or gain set, or a number that is not finite.
+    """
+    check_models(derivatives, gains)
+    loop = SampledLoop(derivatives, gains[0], profile, motor_lag_s, transport_delay_s)
+    return stacked([margins_of_loop(Sampled(loop.with_gains(one)), len(derivatives)) for one in gains])
+
+
+def check_models(derivatives: FloatArray, gains: Sequence[RollGains]) -> None:
+    """Refuse samples and gains that no loop can be made of.
+
+    Raises:
+        UsageError: no sample or gain set, or a number that is not finite.
+    """
+    if derivatives.ndim != 2 or derivatives.shape[1] != len(DERIVATIVE_NAMES) or not len(derivatives):
+        raise UsageError(f"samples of derivatives: shape {derivatives.shape}, want (samples, {len(DERIVATIVE_NAMES)})")
+    if not np.isfinite(derivatives).all():
+        row = int(np.flatnonzero(~np.isfinite(derivatives).all(axis=1))[0])
+        raise UsageError(f"sample {row} of the derivatives is not finite: {derivatives[row].tolist()}")
+    if not gains:
+        raise UsageError("margins of no gain set")
+    for one in gains:
+        if not all(math.isfinite(getattr(one, f.name)) for f in fields(one)):
+            raise UsageError(f"{one}: every gain must be finite")
+
+
+def stacked(rows: Sequence[MarginArrays]) -> MarginArrays:
+    """One more dimension in front."""
+    return MarginArrays(**{f.name: np.stack([getattr(row, f.name) for row in rows]) for f in fields(MarginArrays)})
+
+
+def margins_of_loop(loop: Loop, samples: int) -> MarginArrays:
+    """Margins of S loops.
+
+    Args:
+        loop: all of them. samples: S.
+
+    Returns:
+        arrays (S,).
+    """
+    found = Crossings(loop, samples)
+    every = np.arange(samples)
+    unstable = loop.unstable(every, np.ones(samples))
+    stable = unstable == 0
+    low, high, high_at = _gain_range(loop, found, stable)
+    phase, delay = _phase_and_delay(found, unstable, loop.delay_s)
+    modulus = least_of(loop, found.nearest, lambda value: np.abs(1.0 + value))
+    with np.errstate(all="ignore"):
+        inverse = least_of(loop, found.largest, lambda value: np.abs(1.0 + value) / np.abs(value))
+        low_db, high_db = 20.0 * np.log10(low), 20.0 * np.log10(high)
+        peaks = 1.0 / modulus, 1.0 / inverse
+    crossover = np.full(samples, math.nan)
+    falling = found.unity.falling
+    np.fmax.at(crossover, found.unity.row[falling], found.unity.omega[falling])
+    return MarginArrays(
+        closed_loop_stable=stable,
+        gain_margin_low_db=np.where(np.isneginf(low_db), math.nan, low_db),
+        gain_margin_high_db=high_db,
+        phase_margin_deg=phase,
+        delay_margin_s=delay,
+        modulus_margin=modulus,
+        sensitivity_peak=peaks[0],
+        complementary_peak=peaks[1],
+        crossover_rad_s=crossover,
+        phase_crossover_rad_s=high_at,
+    )
+
+
+def _gain_range(
+    loop: Loop, found: Crossings, stable: npt.NDArray[np.bool_]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(low, high, frequency at high) of the nearest range of gain factors with a stable closed loop; each (S,).
+
+    Between two neighbouring critical gains no eigenvalue can cross the boundary, so one look inside each range
+    decides it. low is 0 for a range that begins at zero; all are NaN if there is no stable range.
+    """
+    critical = found.critical
+    low, high = np.zeros(found.samples), np.full(found.samples, math.inf)
+    at = np.full(found.samples, math.nan)
+    below = critical.gain <= 1.0
+    np.maximum.at(low, critical.row[below], critical.gain[below])
+    # sorted by sample and gain: the first above 1 of each sample
+    rows, first = np.unique(critical.row[~below], return_index=True)
+    high[rows], at[rows] = critical.gain[~below][first], critical.omega[~below][first]
+    for row in np.flatnonzero(~stable).tolist():
+        mine = critical.row == row
+        low[row], high[row], at[row] = _nearest_range(loop, row, critical.gain[mine], critical.omega[mine])
+    return low, high, at
+
+
+def _nearest_range(loop: Loop, row: int, gains: FloatArray, omega: FloatArray) -> tuple[float, float, float]:
+    """The same for one unstable loop: its ranges in order of distance, until one is stable."""
+    edges = [0.0, *gains.tolist(), math.inf]
+    ranges = [(a, b, w) for (a, b), w in zip(pairwise(edges), [*omega.tolist(), math.nan], strict=True) if a < b]
+    inside = np.array([_inside(a, b) for a, b, _ in ranges])
+    unstable = loop.unstable(np.full(len(inside), row), inside)
+    held = [one for one, count in zip(ranges, unstable.tolist(), strict=True) if count == 0]
+    return min(held, key=lambda one: _distance(one[0], one[1]), default=(math.nan, math.nan, math.nan))
+
+
+def _distance(low: float, high: float) -> float:
+    """How far a range of gain factors is from 1, as a ratio's logarithm; 0 if 1 lies in it."""
+    if high <= 1.0:
+        return -math.log(high)
+    return math.log(low) if low > 1.0 else 0.0
+
+
+def _inside(low: float, high: float) -> float:
+    """A gain factor well inside a range: the present gain if that is."""
+    if low < 1.0 < high:
+        return 1.0
+    if math.isinf(high):
+        return 2.0 * low
+    return math.sqrt(low * high) if low else 0.5 * high
+
+
+def _phase_and_delay(found: Crossings, unstable: IndexArray, loop_delay_s: float) -> tuple[FloatArray, FloatArray]:
+    """Phase margin in degrees and delay margin in s; each (S,)."""
+    phase, delay = np.full((2, found.samples), math.inf)
+    unity = found.unity
+    np.minimum.at(phase, unity.row, np.minimum(unity.phase_deg, 360.0 - unity.phase_deg))
+    np.minimum.at(delay, unity.row, np.radians(unity.phase_deg) / unity.omega)
+    for row in np.flatnonzero(unstable).tolist():
+        mine = unity.row == row
+        where = list(zip(unity.omega[mine], unity.phase_deg[mine], unity.falling[mine], strict=True))
+        count = int(unstable[row])
+        leads = [(360.0 - p, bool(inwards)) for _, p, inwards in where]
+        phase[row] = -_lead_to_stability(leads, count, 180.0)
+        events = [
+            (math.radians(360.0 - p + 360.0 * turn) / w, bool(inwards))
+            for w, p, inwards in where
+            for turn in range(1 + math.ceil(loop_delay_s * w / (2.0 * math.pi)))
+        ]
+        delay[row] = -_lead_to_stability(events, count, loop_delay_s)
+    return phase, delay
+
+
+def _lead_to_stability(events: list[tuple[float, bool]], unstable: int, most: float) -> float:
+    """Least lead after which no eigenvalue is left outside; NaN if none up to `most` does.
+
+    Args:
+        events: (lead at which an eigenvalue pair meets the boundary, whether lead brings it inside).
+        unstable: eigenvalues outside now. most: lead beyond which not to look.
+    """
+    for lead, inwards in sorted(events):
+        if lead > most:
+            break
+        unstable += -2 if inwards else 2
+        if unstable == 0:
+            return lead
+    return math.nan
