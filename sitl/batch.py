@@ -22,9 +22,13 @@ from sitl.roll_loop import LOST_RAD, RollTorque, gravity_excess, lateral_row, ro
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
+IndexArray = npt.NDArray[np.intp]
+
+GAINS = ("att_gain", "k", "kp", "ki", "kd", "kff")
+"""Fields of CONTROL_SETTINGS that each lane has its own value of; those of the roll axis."""
 
 LANES = 32
-"""Samples flown side by side: enough for the vector unit, few enough to stay in the cache."""
+"""Pairs of a gain set and a sample flown side by side: enough for the vector unit, few enough to stay in the cache."""
 
 COMPILE_STEPS = 8_000_000
 """Steps that numpy flies in the time that compiling takes: a smaller job on a cold machine is not compiled."""
@@ -78,16 +82,16 @@ class RollJob:
 
 @dataclass(frozen=True)
 class Block:
-    """What some neighbouring samples flew with one gain set.
+    """What some pairs of a gain set and a sample flew.
 
     Attributes:
-        gain_set: its number. first: number of the first sample.
+        gain_set, sample: (n,) number of each.
         phi_rad, p_rad_s, delta_lat: (T, n) at every tick: before the tick's motion, and the torque of its commands.
         lost: (n,) the roll angle passed 80 degrees; the rest of that sample is frozen.
     """
 
-    gain_set: int
-    first: int
+    gain_set: IndexArray
+    sample: IndexArray
     phi_rad: FloatArray
     p_rad_s: FloatArray
     delta_lat: FloatArray
@@ -97,6 +101,7 @@ class Block:
 @compiled
 def fly_lanes(
     settings_array: npt.NDArray[np.void],
+    gains: FloatArray,
     matrices: FloatArray,
     phi_sp: FloatArray,
     delay_ticks: int,
@@ -108,18 +113,18 @@ def fly_lanes(
     out: FloatArray,
     lost: BoolArray,
 ) -> None:
-    """Fly LANES samples with one gain set.
+    """Fly LANES pairs of a gain set and a sample.
 
     Args:
-        settings_array: (1,) of CONTROL_SETTINGS. matrices: (4, 6, LANES) of `step_matrices`, lanes last.
+        settings_array: (1,) of CONTROL_SETTINGS: all but the gains. gains: (6, LANES) in the order of GAINS.
+        matrices: (4, 6, LANES) of `step_matrices`, lanes last.
         phi_sp: (T,). delay_ticks, limit, clips, most, given_table, delta_table: see `RollJob`, `RollTorque`.
         out: (3, T, LANES) output: phi, p, delta_lat. lost: (LANES,) output.
     """
     s: Record = settings_array[0]
     b0, b1, b2, a1, a2 = s.low_pass[0], s.low_pass[1], s.low_pass[2], s.low_pass[3], s.low_pass[4]
     alpha, dt_s, linear, late = s.dgyro_alpha, s.dt_s, s.linear, s.rate_sp_late
-    k_phi, rate_max, int_lim = s.att_gain[0], s.rate_max[0], s.int_lim[0]
-    k, kp, ki, kd, kff = s.k[0], s.kp[0], s.ki[0], s.kd[0], s.kff[0]
+    rate_max, int_lim = s.rate_max[0], s.int_lim[0]
     whole = int(s.attitude_late_ticks)
     part = s.attitude_late_ticks - whole
     limits, status_ticks, notches = s.limits, s.status_ticks, s.notch_count
@@ -158,7 +163,9 @@ def fly_lanes(
                 x[_MEASURED, j], x[_SEEN, j], wanted_phi,
                 x[_Y, j], x[_ACCEL, j], x[_DELAY0, j], x[_DELAY1, j], x[_INTEGRAL, j], x[_RATE_SP, j],
                 x[_POSITIVE, j] != 0.0, x[_NEGATIVE, j] != 0.0,
-                b0, b1, b2, a1, a2, alpha, dt_s, k_phi, rate_max, k, kp, ki, kd, kff, int_lim, linear, late,
+                b0, b1, b2, a1, a2, alpha, dt_s,
+                gains[0, j], rate_max, gains[1, j], gains[2, j], gains[3, j], gains[4, j], gains[5, j], int_lim,
+                linear, late,
             )  # fmt: skip
             x[_TORQUE, j] = torque
             x[_Y, j] = y
@@ -223,37 +230,52 @@ class Batch:
     def __init__(self, job: RollJob, compiled: bool | None = None) -> None:
         self.job = job
         self.compiled = is_compiled(fly_lanes) or job.steps > COMPILE_STEPS if compiled is None else compiled
-        dt_s = float(job.settings["dt_s"][0])
-        self.torques = [roll_torque(one, job.hover_thrust) for one in job.settings]
-        matrices = step_matrices(job.derivatives, job.motor_lag_s, dt_s)
-        self.width = LANES if self.compiled else _ARRAY_WIDTH
-        firsts = range(0, len(matrices), self.width)
-        self._matrices = {first: self._lanes(matrices[first : first + self.width]) for first in firsts}
-        self.blocks = [(g, first) for g in range(len(job.settings)) for first in firsts]
+        self._matrices = step_matrices(job.derivatives, job.motor_lag_s, float(job.settings["dt_s"][0]))
+        self._gains = np.stack(
+            [job.settings[name][:, 0] if job.settings[name].ndim > 1 else job.settings[name] for name in GAINS]
+        )
+        self.blocks: list[tuple[int, IndexArray, IndexArray]] = []
+        self._torques: dict[int, RollTorque] = {}
+        width = LANES if self.compiled else _ARRAY_WIDTH
+        samples = len(job.derivatives)
+        for members in _alike(job.settings):
+            first = int(members[0])
+            self._torques[first] = roll_torque(job.settings[first], job.hover_thrust)
+            for at in range(0, len(members) * samples, width):
+                pairs = np.arange(at, min(at + width, len(members) * samples))
+                self.blocks.append((first, members[pairs // samples], pairs % samples))
 
-    def _lanes(self, matrices: FloatArray) -> FloatArray:
-        """(4, 6, lanes): the last block is filled up with its own last sample."""
-        if self.compiled:
-            missing = self.width - len(matrices)
-            matrices = np.concatenate([matrices, np.repeat(matrices[-1:], missing, axis=0)])
-        return np.ascontiguousarray(np.moveaxis(matrices, 0, 2))
-
-    def fly(self, gain_set: int, first: int) -> Block:
+    def fly(self, number: int) -> Block:
         """Fly one of `blocks`."""
-        job, torque = self.job, self.torques[gain_set]
-        matrices = self._matrices[first]
-        lanes, count = matrices.shape[2], min(self.width, len(job.derivatives) - first)
-        out = np.empty((3, len(job.phi_sp_rad), lanes))
-        lost = np.zeros(lanes, dtype=bool)
-        settings = job.settings[gain_set : gain_set + 1]
+        job = self.job
+        first, gain_set, sample = self.blocks[number]
+        torque, count = self._torques[first], len(sample)
+        # the last block is filled up with its own last pair
+        lanes = np.minimum(np.arange(LANES if self.compiled else count), count - 1)
+        matrices = np.ascontiguousarray(np.moveaxis(self._matrices[sample[lanes]], 0, 2))
+        gains = np.ascontiguousarray(self._gains[:, gain_set[lanes]])
+        out = np.empty((3, len(job.phi_sp_rad), len(lanes)))
+        lost = np.zeros(len(lanes), dtype=bool)
+        settings = job.settings[first : first + 1]
         if self.compiled:
             fly_lanes(
-                settings, matrices, job.phi_sp_rad, job.delay_ticks, torque.limit, torque.clips, torque.most,
+                settings, gains, matrices, job.phi_sp_rad, job.delay_ticks, torque.limit, torque.clips, torque.most,
                 torque.given, torque.delta, out, lost,
             )  # fmt: skip
         else:
-            _fly_arrays(settings[0], matrices, job, torque, out, lost)
-        return Block(gain_set, first, out[0, :, :count], out[1, :, :count], out[2, :, :count], lost[:count])
+            _fly_arrays(settings[0], gains, matrices, job, torque, out, lost)
+        return Block(gain_set, sample, out[0, :, :count], out[1, :, :count], out[2, :, :count], lost[:count])
+
+
+def _alike(settings: npt.NDArray[np.void]) -> list[IndexArray]:
+    """Numbers of the gain sets that differ in their roll gains alone."""
+    rest = settings.copy()
+    for name in GAINS:
+        rest[name] = 0.0
+    groups: dict[bytes, list[int]] = {}
+    for number, one in enumerate(rest):
+        groups.setdefault(one.tobytes(), []).append(number)
+    return [np.array(members) for members in groups.values()]
 
 
 _ARRAY_WIDTH = 1024
@@ -261,6 +283,7 @@ _ARRAY_WIDTH = 1024
 
 def _fly_arrays(
     s: Record,
+    gains: FloatArray,
     matrices: FloatArray,
     job: RollJob,
     torque_of: RollTorque,
@@ -280,8 +303,7 @@ def _fly_arrays(
     part = float(s["attitude_late_ticks"]) - whole
     fixed = (
         *(float(c) for c in s["low_pass"]), float(s["dgyro_alpha"]), float(s["dt_s"]),
-        float(s["att_gain"][0]), float(s["rate_max"][0]),
-        *(float(s[name][0]) for name in ("k", "kp", "ki", "kd", "kff", "int_lim")),
+        gains[0], float(s["rate_max"][0]), *gains[1:], float(s["int_lim"][0]),
         bool(s["linear"]), bool(s["rate_sp_late"]),
     )  # fmt: skip
     level = np.zeros(n)

@@ -68,7 +68,9 @@ class ContinuousLoop:
         return () if self.gains.k * self.gains.ki or at_rest else (0.0,)
 
     def closed_loop_matrix(self, loop_gain: FloatArray, rows: IndexArray) -> FloatArray:
-        """M of x' = M x, the closed loop without set-point; the state is v, p, phi, with lag the motors, and the integral.
+        """M of x' = M x, the closed loop without set-point.
+
+        The state is v, p, phi, with lag the motors, and with K_I the integral.
 
         Args:
             loop_gain: (K,) factor on delta_lat where the loop is cut. rows: (K,) samples.

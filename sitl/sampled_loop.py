@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -49,6 +50,20 @@ class RollGains:
     def from_flight_gains(cls, gains: FlightGains) -> RollGains:
         """The study's parallel form: k = 1, kff = 0."""
         return cls(k_phi=gains.k_phi, k=1.0, kp=gains.kp, ki=gains.ki, kd=gains.kd)
+
+
+class Tick(NamedTuple):
+    """One tick of the closed loop as matrices; S in front if the loop holds samples.
+
+    Attributes:
+        matrix: (N, N). setpoint: (N,) what the roll set-point of this tick adds, as the rate law uses it.
+        delta: (N,) the command of this tick over the state, and `direct` over the set-point, before the cut.
+    """
+
+    matrix: FloatArray
+    setpoint: FloatArray
+    delta: FloatArray
+    direct: float
 
 
 class SampledLoop:
@@ -182,16 +197,24 @@ class SampledLoop:
         return (error + g.k * g.kd * slope) * gyro, (error + g.kff) * attitude
 
     def closed_loop_matrix(self, loop_gain: float | FloatArray = 1.0) -> FloatArray:
-        """One tick of the whole closed loop: state_k+1 = M state_k, without set-point.
-
-        The state is the plant's x_k (v, p, phi and, with lag, the motor), then as far as they exist: commands
-        u_k-1, u_k-2, ...; the gyro filter's two; y_k-1; alpha_k-1; I_k; angles phi_k-1, phi_k-2, ...
+        """One tick of the whole closed loop without set-point: the matrix of `tick`.
 
         Args:
             loop_gain: factor on delta_lat where the loop is cut; (S,) for a factor of each sample.
 
         Returns:
             (N, N), behind S if the loop holds samples.
+        """
+        return self.tick(loop_gain).matrix
+
+    def tick(self, loop_gain: float | FloatArray = 1.0) -> Tick:
+        """One tick of the whole closed loop: state_k+1 = matrix state_k + setpoint phi_sp.
+
+        The state is the plant's x_k (v, p, phi and, with lag, the motor), then as far as they exist: commands
+        u_k-1, u_k-2, ...; the gyro filter's two; y_k-1; alpha_k-1; I_k; angles phi_k-1, phi_k-2, ...
+
+        Args:
+            loop_gain: factor on delta_lat where the loop is cut; (S,) for a factor of each sample.
         """
         g = self.gains
         n = self.phi.shape[-1]
@@ -218,6 +241,7 @@ class SampledLoop:
         )
         integral = unit[integral_at] if integrates else np.zeros(size)
         delta = g.k * g.kp * (rate_sp - y) + integral - g.k * g.kd * alpha + g.kff * rate_sp
+        direct = (g.k * g.kp + g.kff) * g.k_phi
         now = np.broadcast_to(np.asarray(loop_gain)[..., None] * delta, (*lead, size))
         u = [now, *(unit[command_at + i] for i in range(commands))]
 
@@ -236,7 +260,14 @@ class SampledLoop:
             rows[..., integral_at, :] = integral + g.k * g.ki * self.dt_s * (rate_sp - y)
         for i in range(angles):
             rows[..., angle_at + i, :] = phi if i == 0 else unit[angle_at + i - 1]
-        return rows
+        setpoint = np.zeros((*lead, size))
+        if commands:
+            setpoint[..., command_at] = direct * np.asarray(loop_gain)
+        if self.delay_ticks == 0:
+            setpoint[..., :n] = self.held * (direct * np.asarray(loop_gain))[..., None]
+        if integrates:
+            setpoint[..., integral_at] = g.k * g.ki * self.dt_s * g.k_phi
+        return Tick(rows, setpoint, delta, direct)
 
     def eigenvalues(self, loop_gain: float | FloatArray = 1.0) -> ComplexArray:
         """Eigenvalues of one tick of the closed loop; stable if all lie inside the unit circle."""

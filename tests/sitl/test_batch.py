@@ -60,7 +60,7 @@ def job(
 def flown(what: RollJob, compiled: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """phi, p, delta_lat (T, S) and lost (S,) of the first gain set."""
     batch = Batch(what, compiled)
-    blocks = [batch.fly(*place) for place in batch.blocks if place[0] == 0]
+    blocks = [batch.fly(number) for number in range(len(batch.blocks))]
     join = [np.concatenate([getattr(b, name) for b in blocks], axis=1) for name in ("phi_rad", "p_rad_s", "delta_lat")]
     return join[0], join[1], join[2], np.concatenate([b.lost for b in blocks])
 
