@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from scenarios import sitl_command
+from scenarios.tuning import tune_command
 
 if TYPE_CHECKING:
     from scenarios.runner import Progress, RunResult
@@ -79,6 +80,15 @@ def _parser() -> argparse.ArgumentParser:
 
     sub = add("sitl", _sitl, "Serve simulated vehicles to any ground station.", "froude sitl ant-x ant-r --speed 2")
     sitl_command.add_arguments(sub)
+    _vehicle_options(sub)
+
+    sub = add(
+        "tune",
+        _tune,
+        "Make gains by structured H-infinity synthesis, for one vehicle or several at once.",
+        "froude tune ant-r:ant-x --scaling uncertainty,gain",
+    )
+    tune_command.add_arguments(sub)
     _vehicle_options(sub)
     return parser
 
@@ -336,6 +346,12 @@ def _sitl(args: argparse.Namespace) -> int:
     from sitl.vehicle_spec import DEFAULT_SCALING
 
     return sitl_command.run(args, scaling=_words(args.scaling, DEFAULT_SCALING), seed=_seed(args), tell=_tell)
+
+
+def _tune(args: argparse.Namespace) -> int:
+    from sitl.vehicle_spec import DEFAULT_SCALING
+
+    return tune_command.run(args, scaling=_words(args.scaling, DEFAULT_SCALING), seed=_seed(args))
 
 
 if __name__ == "__main__":

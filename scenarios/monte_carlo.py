@@ -21,6 +21,7 @@ from scenarios.manoeuvres import EPSILON_S, Manoeuvre, Window
 from scenarios.metrics import effort_metrics, oscillation, step_metrics, track_metrics
 from scenarios.roll_set import RollSet, roll_sets
 from sitl.batch import Batch, Block, RollJob
+from sitl.control_loop import CONTROL_SETTINGS
 from sitl.errors import UsageError
 from sitl.profile import Profile
 from sitl.sampled_loop import RollGains
@@ -159,7 +160,9 @@ def monte_carlo(
         )
     worst = _Worst(len(sets), len(derivatives))
     kept = np.empty((3, len(sets), len(derivatives), length)) if keep_traces else None
-    settings = np.array([one.settings for one in sets])
+    settings = np.zeros(len(sets), CONTROL_SETTINGS)
+    for number, one in enumerate(sets):
+        settings[number] = one.settings
     workers = threads or os.cpu_count() or 1
     with ThreadPoolExecutor(workers) as pool:
         found = pool.submit(_margins, derivatives, sets, lag_s) if margins else None
@@ -171,9 +174,8 @@ def monte_carlo(
             for block, values in _fly(Batch(job, compiled), manoeuvre, signal, profile.dt_s, pool, workers):
                 worst.add(block, values)
                 if kept is not None:
-                    place = (slice(block.first, block.first + len(block.lost)), slice(at, at + len(signal)))
                     for i, trace in enumerate((block.phi_rad, block.delta_lat, block.p_rad_s)):
-                        kept[i, block.gain_set][place] = trace.T
+                        kept[i, block.gain_set, block.sample, at : at + len(signal)] = trace.T
             at += len(signal)
         margin_arrays = found.result() if found is not None else None
     traces = None
@@ -219,18 +221,18 @@ def _fly(
 ) -> Iterator[tuple[Block, Values]]:
     """Blocks in order, a few ahead of the reader at a time: memory does not grow with the job."""
 
-    def one(gain_set: int, first: int) -> tuple[Block, Values]:
-        block = batch.fly(gain_set, first)
+    def one(number: int) -> tuple[Block, Values]:
+        block = batch.fly(number)
         measure = _measure_lanes if batch.compiled else _measure_each
         values = [(window, measure(block, window, signal, dt_s)) for window in manoeuvre.windows]
         return block, values
 
     ahead = 2 * workers
-    waiting = [pool.submit(one, *place) for place in batch.blocks[:ahead]]
+    waiting = [pool.submit(one, n) for n in range(min(ahead, len(batch.blocks)))]
     for n in range(len(batch.blocks)):
         done = waiting.pop(0).result()
         if n + ahead < len(batch.blocks):
-            waiting.append(pool.submit(one, *batch.blocks[n + ahead]))
+            waiting.append(pool.submit(one, n + ahead))
         yield done
 
 
@@ -285,7 +287,7 @@ class _Worst:
         self.diverged: BoolArray = np.zeros(self._shape, dtype=bool)
 
     def add(self, block: Block, values: Values) -> None:
-        place = block.gain_set, slice(block.first, block.first + len(block.lost))
+        place = block.gain_set, block.sample
         self.diverged[place] |= block.lost
         for _, metrics in values:
             for name, value in metrics.items():

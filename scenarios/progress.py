@@ -64,3 +64,17 @@ def progress_bar() -> Iterator[Callable[[Progress], object]]:
             )
 
         yield show
+
+
+@contextmanager
+def spinner() -> Iterator[Callable[[str], object]]:
+    """Yields a callback for what is being done: a line that moves on a terminal, nothing elsewhere."""
+    import sys
+
+    from rich.console import Console
+
+    if sys.stderr is None or not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    with Console(stderr=True).status("getting ready") as status:
+        yield lambda text: status.update(text)

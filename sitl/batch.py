@@ -269,12 +269,11 @@ class Batch:
 
 def _alike(settings: npt.NDArray[np.void]) -> list[IndexArray]:
     """Numbers of the gain sets that differ in their roll gains alone."""
-    rest = settings.copy()
-    for name in GAINS:
-        rest[name] = 0.0
+    # field by field: what lies between the fields of a record is not ours
+    rest = [settings[name] for name in settings.dtype.names or () if name not in GAINS]
     groups: dict[bytes, list[int]] = {}
-    for number, one in enumerate(rest):
-        groups.setdefault(one.tobytes(), []).append(number)
+    for number in range(len(settings)):
+        groups.setdefault(b"".join(field[number].tobytes() for field in rest), []).append(number)
     return [np.array(members) for members in groups.values()]
 
 

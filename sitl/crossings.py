@@ -13,6 +13,7 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 IndexArray = npt.NDArray[np.intp]
+BoolArray = npt.NDArray[np.bool_]
 
 # A critical gain further than this from the present one (200 dB) is none.
 GAIN_RANGE = 1e10
@@ -59,7 +60,7 @@ class Unity:
     omega: FloatArray
     phase_deg: FloatArray
     """Phase of L above -180 degrees, in [0, 360): the lag that takes it there."""
-    falling: npt.NDArray[np.bool_]
+    falling: BoolArray
     """|L| falls with frequency: more lag here makes an eigenvalue pair unstable; where it rises, stable."""
 
 
@@ -69,7 +70,7 @@ class Crossings:
     def __init__(self, loop: Loop, samples: int) -> None:
         omega = loop.grid()
         real: list[tuple[IndexArray, IndexArray]] = []
-        unity: list[tuple[IndexArray, IndexArray, npt.NDArray[np.bool_]]] = []
+        unity: list[tuple[IndexArray, IndexArray, BoolArray]] = []
         nearest, largest = np.empty((2, 2, samples), dtype=np.intp)
         for first in range(0, samples, _CHUNK):
             rows = slice(first, min(first + _CHUNK, samples))
@@ -106,7 +107,7 @@ class Crossings:
         return CriticalGains(row[order], gain[order], roots[order])
 
     @staticmethod
-    def _unity(loop: Loop, omega: FloatArray, row: IndexArray, at: IndexArray, falling: npt.NDArray[np.bool_]) -> Unity:
+    def _unity(loop: Loop, omega: FloatArray, row: IndexArray, at: IndexArray, falling: BoolArray) -> Unity:
         roots = _roots(lambda w, k: np.log(np.abs(loop.values(w, row[k]))), omega[at], omega[at + 1])
         phase = (np.degrees(np.angle(loop.values(roots, row))) + 180.0) % 360.0
         return Unity(row, roots, phase, falling)

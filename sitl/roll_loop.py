@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
 from sitl.actuators import MAX_MOTORS, ROLL, allocate, motor_output
 from sitl.array_form import plain_form
-from sitl.compiled import Record, compiled, inlined, is_compiled, select
+from sitl.compiled import compiled, inlined, is_compiled, select
 from sitl.errors import UsageError
 from sitl.filters import biquad_step, constrain, slope_step
 from sitl.lateral import G_M_S2
@@ -151,21 +152,41 @@ def roll_torque(settings: npt.NDArray[np.void], hover_thrust: float) -> RollTorq
         return RollTorque(math.inf, True, 0.0, none, none)
     if np.isfinite(s["slew_per_tick"][:n]).any():
         raise UsageError("CA_Rn_SLEW: the batch has no slew limit of motors; set it to 0, or fly the set instead")
-    given, delta = _probe(s, np.linspace(-_MOST_TORQUE, _MOST_TORQUE, _PROBES), hover_thrust)
+    numbers = (n, int(s["method"]), int(s["airmode"]), float(s["thr_mdl_fac"]), hover_thrust)
+    return _worked_out(s["mix"].tobytes(), s["inverse"].tobytes(), *numbers)
+
+
+@lru_cache(maxsize=64)
+def _worked_out(
+    mix: bytes, inverse: bytes, n: int, method: int, airmode: int, curve: float, hover_thrust: float
+) -> RollTorque:
+    """`roll_torque` of a geometry: worked out once, however often its gains change."""
+    columns, rows = np.frombuffer(mix).reshape(-1, 4), np.frombuffer(inverse).reshape(4, -1)
+    allocation = (columns, rows[ROLL, :n], n, method, airmode, curve, hover_thrust)
+    none = np.zeros(0)
+    given, delta = _probe(np.linspace(-_MOST_TORQUE, _MOST_TORQUE, _PROBES), *allocation)
     limit = float(given.max())
     clipped = np.clip(np.linspace(-_MOST_TORQUE, _MOST_TORQUE, _PROBES), -limit, limit)
     if np.abs(clipped - delta).max() < 1e-9:
         return RollTorque(limit, True, 0.0, none, none)
-    given, delta = _probe(s, np.linspace(-_MOST_TORQUE, _MOST_TORQUE, _TABLE), hover_thrust)
+    given, delta = _probe(np.linspace(-_MOST_TORQUE, _MOST_TORQUE, _TABLE), *allocation)
     return RollTorque(limit, False, _MOST_TORQUE, given, delta)
 
 
-def _probe(s: Record, torques: FloatArray, hover_thrust: float) -> tuple[FloatArray, FloatArray]:
+def _probe(
+    torques: FloatArray,
+    mix: FloatArray,
+    inverse: FloatArray,
+    n: int,
+    method: int,
+    airmode: int,
+    curve: float,
+    hover_thrust: float,
+) -> tuple[FloatArray, FloatArray]:
     """(given, delta) of `RollTorque` at some torques, by the allocation that flies."""
     ready = is_compiled(allocate)
     motors_for, output_of = (allocate, motor_output) if ready else (plain_form(allocate), plain_form(motor_output))
-    n, method, airmode, curve = int(s["motor_count"]), int(s["method"]), int(s["airmode"]), float(s["thr_mdl_fac"])
-    mix, inverse = np.ascontiguousarray(s["mix"]), s["inverse"][ROLL, :n]
+    mix = mix.copy()  # the compiled allocation knows arrays that may be written to
     given, delta = np.empty(len(torques)), np.empty(len(torques))
     motors, wanted = np.empty(MAX_MOTORS), np.zeros(3)
     for i, torque in enumerate(torques):
