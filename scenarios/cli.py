@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from scenarios import sitl_command
+from scenarios.study import study_command
 from scenarios.tuning import tune_command
 
 if TYPE_CHECKING:
@@ -90,6 +91,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     tune_command.add_arguments(sub)
     _vehicle_options(sub)
+
+    sub = add("study", _study, "Recompute the study: every table, figure and conclusion.", "froude study --tune")
+    study_command.add_arguments(sub)
     return parser
 
 
@@ -352,6 +356,10 @@ def _tune(args: argparse.Namespace) -> int:
     from sitl.vehicle_spec import DEFAULT_SCALING
 
     return tune_command.run(args, scaling=_words(args.scaling, DEFAULT_SCALING), seed=_seed(args))
+
+
+def _study(args: argparse.Namespace) -> int:
+    return study_command.run(args, seed=_seed(args))
 
 
 if __name__ == "__main__":

@@ -120,7 +120,7 @@ def monte_carlo(
     distribution: Distribution = "gaussian",
     spread_sigma: float = 3.0,
     derivatives: FloatArray | None = None,
-    keep_traces: bool = False,
+    trace_every: int = 0,
     margins: bool = True,
     setpoint_rate_hz: float = SETPOINT_RATE_HZ,
     threads: int | None = None,
@@ -133,7 +133,7 @@ def monte_carlo(
         manoeuvres: each from level flight, without wind or noise.
         samples, seed, distribution, spread_sigma: of the random models beside the nominal one.
         derivatives: (S, 6) to fly instead of drawing.
-        keep_traces: keep what was flown. margins: work out the loop's margins too.
+        trace_every: keep what was flown at every n-th tick; 0 keeps nothing. margins: work out the loop's margins too.
         setpoint_rate_hz: set-points are held in between. threads: None takes all cores.
         compiled: as `sitl.batch.Batch`.
 
@@ -152,36 +152,55 @@ def monte_carlo(
         derivatives = draw_samples(model, samples, seed, distribution, spread_sigma)
     lag_s = profile.motor_lag(model.assumptions.motor_lag_s)
     signals = [_ticks(manoeuvre, profile, setpoint_rate_hz) for manoeuvre in manoeuvres]
-    length = sum(len(signal) for signal in signals)
-    if keep_traces and 24.0 * len(sets) * len(derivatives) * length > TRACES_BYTES:
-        raise UsageError(
-            f"the traces of {len(sets)} gain sets x {len(derivatives)} samples x {length} ticks would fill "
-            f"{24.0 * len(sets) * len(derivatives) * length / 1e9:.0f} GB: keep fewer, or none"
-        )
+    kept = _Kept(signals, len(sets), len(derivatives), trace_every, profile.dt_s) if trace_every else None
     worst = _Worst(len(sets), len(derivatives))
-    kept = np.empty((3, len(sets), len(derivatives), length)) if keep_traces else None
     settings = np.zeros(len(sets), CONTROL_SETTINGS)
     for number, one in enumerate(sets):
         settings[number] = one.settings
     workers = threads or os.cpu_count() or 1
     with ThreadPoolExecutor(workers) as pool:
         found = pool.submit(_margins, derivatives, sets, lag_s) if margins else None
-        at = 0
-        for manoeuvre, signal in zip(manoeuvres, signals, strict=True):
+        for number, (manoeuvre, signal) in enumerate(zip(manoeuvres, signals, strict=True)):
             job = RollJob(
                 settings, derivatives, lag_s, profile.transport_delay_ticks, model.assumptions.hover_thrust, signal
             )
             for block, values in _fly(Batch(job, compiled), manoeuvre, signal, profile.dt_s, pool, workers):
                 worst.add(block, values)
                 if kept is not None:
-                    for i, trace in enumerate((block.phi_rad, block.delta_lat, block.p_rad_s)):
-                        kept[i, block.gain_set, block.sample, at : at + len(signal)] = trace.T
-            at += len(signal)
+                    kept.add(number, block)
         margin_arrays = found.result() if found is not None else None
-    traces = None
-    if kept is not None:
-        traces = Traces(np.arange(length) / profile.rate_hz, np.concatenate(signals), *kept)
+    traces = None if kept is None else kept.traces
     return MonteCarlo(tuple(gains), derivatives, worst.metrics(), margin_arrays, worst.diverged, traces)
+
+
+class _Kept:
+    """Every n-th tick of what is flown, manoeuvre after manoeuvre."""
+
+    def __init__(self, signals: Sequence[FloatArray], sets: int, samples: int, every: int, dt_s: float) -> None:
+        self._every = every
+        self._starts = [0]
+        for signal in signals:
+            self._starts.append(self._starts[-1] + len(signal[::every]))
+        size = 24.0 * sets * samples * self._starts[-1]
+        if size > TRACES_BYTES:
+            raise UsageError(
+                f"the traces of {sets} gain sets x {samples} samples x {self._starts[-1]} ticks would fill "
+                f"{size / 1e9:.0f} GB: keep fewer, or none"
+            )
+        starts_s = np.cumsum([0.0, *(len(signal) * dt_s for signal in signals[:-1])])
+        t_s = [start + np.arange(len(signal))[::every] * dt_s for start, signal in zip(starts_s, signals, strict=True)]
+        blank = (np.empty((sets, samples, self._starts[-1])) for _ in range(3))
+        self.traces = Traces(np.concatenate(t_s), np.concatenate([signal[::every] for signal in signals]), *blank)
+
+    def add(self, number: int, block: Block) -> None:
+        place = (block.gain_set, block.sample, slice(self._starts[number], self._starts[number + 1]))
+        kept = self.traces
+        for into, flown in (
+            (kept.phi_rad, block.phi_rad),
+            (kept.delta_lat, block.delta_lat),
+            (kept.p_rad_s, block.p_rad_s),
+        ):
+            into[place] = flown[:: self._every].T
 
 
 def _ticks(manoeuvre: Manoeuvre, profile: Profile, setpoint_rate_hz: float) -> FloatArray:
