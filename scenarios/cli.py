@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from scenarios import sitl_command
+from scenarios import analyse_command, sitl_command
 from scenarios.study import study_command
 from scenarios.tuning import tune_command
 
@@ -81,6 +81,15 @@ def _parser() -> argparse.ArgumentParser:
 
     sub = add("sitl", _sitl, "Serve simulated vehicles to any ground station.", "froude sitl ant-x ant-r --speed 2")
     sitl_command.add_arguments(sub)
+    _vehicle_options(sub)
+
+    sub = add(
+        "analyse",
+        _analyse,
+        "Margins and a Monte Carlo of gain sets over an uncertain model, without a flight.",
+        "froude analyse --vehicle ant-x --gains table_7_2 table_2_2/ANT-X",
+    )
+    analyse_command.add_arguments(sub)
     _vehicle_options(sub)
 
     sub = add(
@@ -350,6 +359,12 @@ def _sitl(args: argparse.Namespace) -> int:
     from sitl.vehicle_spec import DEFAULT_SCALING
 
     return sitl_command.run(args, scaling=_words(args.scaling, DEFAULT_SCALING), seed=_seed(args), tell=_tell)
+
+
+def _analyse(args: argparse.Namespace) -> int:
+    from sitl.vehicle_spec import DEFAULT_SCALING
+
+    return analyse_command.run(args, scaling=_words(args.scaling, DEFAULT_SCALING), seed=_seed(args), tell=_tell)
 
 
 def _tune(args: argparse.Namespace) -> int:

@@ -231,7 +231,7 @@ def _chapter_7(pairs: Sequence[Pair]) -> list[Conclusion]:
             "7",
             "The gain margin is infinite for all samples.",
             of(lambda p: p.margins["gain_margin_high_db"]),
-            lambda v: np.isposinf(v),
+            lambda v: np.asarray(np.isposinf(v)),
             "dB, at least, upwards, continuous loop; downwards it never is",
         ),
     ):

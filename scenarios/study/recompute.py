@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from importlib.metadata import version
 
+from scenarios.study.beyond import beyond
 from scenarios.study.conclusions import conclusions
 from scenarios.study.errata import errata
 from scenarios.study.pairs import fly_pairs, printed_gains
@@ -42,6 +43,8 @@ def recompute(
                 fly_pairs(made, get_profile(profile), samples=samples, seed=seed, source=f"tuned for {profile}")
             )
             extra.append(fly_pairs_live(made, profile, seed, progress))
+    progress("beyond the study")
+    more, said = beyond()
     found = tables(tuned)
     settings = {
         "command": f"froude study --samples {samples} --seed {seed}" + (" --tune" if tune else ""),
@@ -52,4 +55,4 @@ def recompute(
         "tracking input": "ours: steps, ramps and a multisine up to 2 Hz (the study's figure 7.2 is not available)",
         "margins": "profile study: continuous loop as the study's, and sampled; others: sampled",
     }
-    return Study(found, errata(found), conclusions(pairs), tuple(pairs), tuple(extra), settings)
+    return Study(found, errata(found), (*conclusions(pairs), *said), tuple(pairs), (*extra, *more), settings)
