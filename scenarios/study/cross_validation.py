@@ -102,6 +102,9 @@ def fly_live(target: str, reference: str, gains: RollGains, profile: str, seed: 
     from scenarios.tuning.tuned_set import parameters_of
 
     scenario = replace(load_scenario("demo"), vehicle=target, scaling=(), profile=profile, seed=seed)
+    if profile == "study":
+        # without filters ANT-R's own pitch gains are unstable (K_D Ld > 1): there pitch flies what roll flies
+        scenario = replace(scenario, axes="both")
     gain_set = GainSet(f"tuned {target} on {reference}", parameters_of(gains))
     job = plan(gain_set, scenario, scenario.resolve_vehicle(), scenario.resolve_profile())
     record = fly(job)

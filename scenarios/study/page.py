@@ -29,7 +29,7 @@ def study_page(study: Study, figures: Sequence[Figure]) -> str:
         agree=sum(row.agrees is True for row in rows),
         compared=len(rows),
         errata=study.errata,
-        verdicts=Counter(str(c.verdict) for c in study.conclusions),
+        verdicts=Counter(str(c.verdict) for c in study.conclusions if c.section != "ours"),
         conclusions=study.conclusions,
         kinds=_kinds(study),
         extra=[_extra(table) for table in study.extra],

@@ -29,7 +29,7 @@ class Row:
         printed: as the study prints it; None where it prints nothing.
         ours: recomputed; None where it is an input that nothing recomputes.
         digits: decimals that the study prints, so that its rounding is not taken for a difference.
-        erratum: why the printed value is wrong; empty if it is not.
+        compared: whether ours is meant to be the printed number; not where it is another design.
     """
 
     item: str
@@ -38,7 +38,7 @@ class Row:
     printed: float | None
     ours: float | None
     digits: int | None = None
-    erratum: str = ""
+    compared: bool = True
 
     @property
     def difference(self) -> float | None:
@@ -48,7 +48,7 @@ class Row:
     @property
     def agrees(self) -> bool | None:
         """Whether ours rounds to the printed value, to one unit of its last digit; None if there is no pair."""
-        if self.printed is None or self.ours is None:
+        if self.printed is None or self.ours is None or not self.compared:
             return None
         step = 10.0**-self.digits if self.digits is not None else 1e-9 * max(1.0, abs(self.printed))
         return abs(self.ours - self.printed) <= 1.0001 * step

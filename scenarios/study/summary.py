@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenarios.study.printed import printed
 from scenarios.study.result import FloatArray, Pair
+from scenarios.tuning.requirements import requirements_for
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,8 @@ class PairLine:
     Attributes:
         settling_s: median and worst (5 % band). overshoot_pct: worst. vaf_pct: median. peak_delta_lat: worst.
         phase_margin_deg, delay_margin_s, gain_margin_high_db: least; of the loop as `Pair.margins` says.
-        oscillation_rad_s: worst. meets: share of the samples that meet the study's requirements.
+        oscillation_rad_s: worst. meets: share of the samples that meet the requirements of
+            the profile (`scenarios.tuning.requirements`): those of the study for its own.
     """
 
     settling_s: tuple[float, float]
@@ -38,9 +39,10 @@ def line_of(pair: Pair) -> PairLine:
     Args:
         pair: flown.
     """
-    required = printed()["requirements"]
+    required = requirements_for(pair.profile)
     settling, overshoot = pair.metrics["settling_time_5pct_s"], pair.metrics["overshoot_pct"]
-    good = (settling <= float(required["settling_time_max_s"])) & (overshoot <= float(required["overshoot_max_pct"]))
+    good = (settling <= required.settling_time_s) & (overshoot <= required.overshoot_pct)
+    good &= (pair.margins["closed_loop_stable"] > 0.0) & (pair.margins["delay_margin_s"] >= required.delay_margin_s)
     return PairLine(
         settling_s=(_of(settling, np.median), _worst(settling)),
         overshoot_pct=_worst(overshoot),

@@ -6,6 +6,7 @@ Ours comes from the airframe files, the scaling law and the model; the print is 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from decimal import Decimal
 from typing import Any
 
@@ -132,7 +133,8 @@ def _synthesised(number: str, target: str, tuned: Tuned | None) -> Table:
             mine = float(ours[name].parameters[parameter]) if tuned is None else None
             if made is not None:
                 mine = float(getattr(made, GAIN_FIELDS[gain]))
-            rows.append(row(gain, name, GAIN_UNITS[gain], value, mine))
+            one = row(gain, name, GAIN_UNITS[gain], value, mine)
+            rows.append(replace(one, compared=tuned is None))
     note = (
         "Inputs: the built-in gain sets. `froude study --tune` makes gains of our own."
         if tuned is None

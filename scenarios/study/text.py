@@ -28,7 +28,7 @@ def study_text(study: Study) -> str:
         lines.append(f"  table {table.number:<4} {_agreement(table):<26} {table.title}")
     lines += ["", f"Errata found: {len(study.errata)}"]
     lines += [f"  {e.where}: printed {e.printed}, follows {e.follows}" for e in study.errata]
-    verdicts = Counter(str(c.verdict) for c in study.conclusions)
+    verdicts = Counter(str(c.verdict) for c in study.conclusions if c.section != "ours")
     lines += ["", "Conclusions: " + ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items())]
     for c in study.conclusions:
         lines += _wrapped(f"  {str(c.verdict).upper():<10} {c.section:<4} {c.statement}", 18)
@@ -41,6 +41,8 @@ def study_text(study: Study) -> str:
 
 
 def _agreement(table: Table) -> str:
+    if not any(row.compared for row in table.rows):
+        return "another design"
     compared = [row for row in table.rows if row.agrees is not None]
     good = sum(row.agrees is True for row in compared)
     return f"{good} of {len(compared)} numbers agree"
