@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from scenarios import analyse_command, sitl_command
+from scenarios.identification import identify_command
 from scenarios.study import study_command
 from scenarios.tuning import tune_command
 
@@ -100,6 +101,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     tune_command.add_arguments(sub)
     _vehicle_options(sub)
+
+    sub = add(
+        "identify",
+        identify_command.run,
+        "Make an airframe file from a flown multisine, with intervals.",
+        "froude identify logs/20261123T081638Z_identify_ANT-X",
+    )
+    identify_command.add_arguments(sub)
 
     sub = add("study", _study, "Recompute the study: every table, figure and conclusion.", "froude study --tune")
     study_command.add_arguments(sub)

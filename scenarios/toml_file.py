@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -21,3 +22,13 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise FileError(path, f"cannot be read: {error.strerror or error}", "Check the path") from error
     except (ValueError, RecursionError) as error:  # bad TOML and bad UTF-8 are ValueErrors
         raise FileError(path, f"not a TOML file: {error}", "Correct the line it names") from error
+
+
+def quoted(text: str) -> str:
+    """A basic string of TOML; control characters become spaces.
+
+    Args:
+        text: any.
+    """
+    safe = re.sub(r"[\x00-\x1f\x7f]", " ", text)
+    return '"' + safe.replace("\\", "\\\\").replace('"', '\\"') + '"'

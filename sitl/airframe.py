@@ -23,6 +23,9 @@ AIRFRAMES_DIR = Path(__file__).parent / "airframes"
 LAYOUTS: dict[str, int | None] = {"X": 4, "H": 4, "octo": 8, "X8": 8, "custom": None}
 MIN_ROTORS, MAX_ROTORS = 3, 12
 
+AIRFRAME_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
+"""What an airframe may be called."""
+
 # PX4's allocator drops an axis whose effectiveness CT * arm is at most 0.05, with CT 6.5 by default.
 MIN_ARM_M = 0.05 / 6.5
 
@@ -170,7 +173,7 @@ def load_airframe(name_or_path: str | Path) -> Airframe:
 
 def _parse(file: KeyedTable) -> Airframe:
     name = file.text("name")
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._+-]*", name):
+    if not AIRFRAME_NAME.fullmatch(name):
         raise file.error("name", f"{name!r} is not a name", "Use letters, digits, '.', '_', '+' and '-'")
     length, width, height = file.numbers("frame_m", 3, above=0.0)
     layout = file.text("layout")

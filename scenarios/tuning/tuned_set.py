@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 from pathlib import Path
 from typing import Any
 
 from scenarios.gain_set import GainSet, save_params
 from scenarios.run_folder import plain, write_atomically
 from scenarios.table import number
+from scenarios.toml_file import quoted
 from scenarios.tuning.tuning import Found, Tuning
 from sitl.errors import FileError
 from sitl.sampled_loop import RollGains
@@ -83,7 +83,7 @@ def write_tuning(tuning: Tuning, path: Path) -> tuple[Path, Path]:
     required = dataclasses.asdict(tuning.requirements)
     lines += [f"#   {name} = {value:g}" for name, value in required.items()]
     lines += ["", "[[gain_set]]"]
-    lines += [f"{key} = {_quoted(getattr(gain_set, key))}" for key in ("name", "source", "note")]
+    lines += [f"{key} = {quoted(getattr(gain_set, key))}" for key in ("name", "source", "note")]
     lines += ["[gain_set.parameters]", *(f"{name} = {value!r}" for name, value in gain_set.parameters.items()), ""]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -93,12 +93,6 @@ def write_tuning(tuning: Tuning, path: Path) -> tuple[Path, Path]:
     params = path.with_suffix(".params")
     save_params(params, gain_set.parameters)
     return path, params
-
-
-def _quoted(text: str) -> str:
-    """A basic string of TOML."""
-    safe = re.sub(r"[\x00-\x1f\x7f]", " ", text)
-    return '"' + safe.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
 def default_path(tuning: Tuning) -> Path:
