@@ -58,7 +58,7 @@ def period_of(frequencies_hz: FloatArray) -> float:
 def spectra(
     t_s: FloatArray, signal: FloatArray, start_s: float, period_s: float, periods: int, omega_rad_s: FloatArray
 ) -> ComplexArray:
-    """Amplitudes of a signal at given frequencies in each period, (periods, F): the integral over the samples' own times.
+    """Amplitudes of a signal at given frequencies in each period, (periods, F), by the integral over its own times.
 
     Args:
         t_s: (n,) s, increasing, not necessarily even. signal: (n,).
