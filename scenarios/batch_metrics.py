@@ -11,6 +11,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from scenarios.batch_tracking import TRACK, track_block
 from scenarios.limits import LIMIT_CYCLE_RAD_S
 from scenarios.metrics import LAST_S, MOST_LAG_S, MOVES_RAD, SETTLE_S
 from sitl.compiled import compiled, select
@@ -18,13 +19,10 @@ from sitl.compiled import compiled, select
 FloatArray = npt.NDArray[np.float64]
 
 STEP = ("overshoot_pct", "rise_time_s", "settling_time_5pct_s", "settling_time_2pct_s", "droop_deg")
-TRACK = ("vaf_pct", "rms_error_deg", "lag_s", "vaf_lag_removed_pct")
 EFFORT = ("peak_delta_lat", "rms_delta_lat")
 OSCILLATION = ("oscillation_rad_s",)
 
 BANDS = (0.05, 0.02)
-_COARSE = 8
-"""Ticks between two lags that are tried first; a roll angle does not change its mind faster."""
 
 
 @compiled
@@ -141,103 +139,6 @@ def effort_block(delta: FloatArray, out: FloatArray) -> None:
     for j in range(n):
         out[0, j] = x[0, j]
         out[1, j] = math.sqrt(x[1, j] / (ticks - 1))
-
-
-@compiled
-def _correlation(x: FloatArray, y: FloatArray, lag: int, stride: int) -> float:
-    total = 0.0
-    for t in range(0, len(x) - lag, stride):
-        total += x[t] * y[t + lag]
-    return total * stride
-
-
-@compiled
-def _lag_ticks(x: FloatArray, y: FloatArray, most: int) -> float:
-    """Lag of y behind x at the peak of their cross-correlation, in ticks; NaN if there is none.
-
-    Args:
-        x, y: (T,), both with their mean taken off.
-    """
-    best, peak = 0, -math.inf
-    for lag in range(0, most + 1, _COARSE):
-        value = _correlation(x, y, lag, _COARSE)
-        if value > peak:
-            best, peak = lag, value
-    peak = _correlation(x, y, best, 1)
-    step = _COARSE
-    while step >= 1:
-        moved = False
-        for lag in (best - step, best + step):
-            if 0 <= lag <= most:
-                value = _correlation(x, y, lag, 1)
-                if value > peak:
-                    best, peak, moved = lag, value, True
-        if not moved:
-            step //= 2
-    power = math.sqrt(_correlation(x, x, 0, 1) * _correlation(y, y, 0, 1) + 1e-300)
-    if peak / power < 0.5 or best == most:
-        return math.nan
-    if best == 0:
-        return 0.0
-    before, after = _correlation(x, y, best - 1, 1), _correlation(x, y, best + 1, 1)
-    bend = before - 2.0 * peak + after
-    return best + (0.5 * (before - after) / bend if bend != 0.0 else 0.0)
-
-
-@compiled
-def _unexplained(phi: FloatArray, phi_sp: FloatArray, lag: float) -> float:
-    """Variance of phi_sp - phi(t + lag) over that of phi_sp, where phi is known."""
-    ticks = len(phi) - math.ceil(lag - 1e-9)
-    whole = int(lag)
-    part = lag - whole
-    error, wanted = np.empty((ticks, 1)), np.empty((ticks, 1))
-    for t in range(ticks):
-        after = phi[t + whole + 1] if part > 0.0 else 0.0
-        error[t, 0] = phi_sp[t] - ((1.0 - part) * phi[t + whole] + part * after)
-        wanted[t, 0] = phi_sp[t]
-    mean, left, all_ = np.empty(1), np.empty(1), np.empty(1)
-    _moments(error, mean, left)
-    _moments(wanted, mean, all_)
-    share: float = left[0] / all_[0]
-    return share
-
-
-@compiled
-def track_block(phi: FloatArray, phi_sp: FloatArray, dt_s: float, most_lag: int, moves: float, out: FloatArray) -> None:
-    """VAF, RMS error, lag and VAF without lag of every lane.
-
-    Args:
-        phi: (T, n) rad. phi_sp: (T,) rad. dt_s: tick, s. most_lag: ticks. moves: least variance of phi_sp, rad^2.
-        out: (4, n) output, in the order of TRACK.
-    """
-    ticks, n = phi.shape
-    wanted = phi_sp.copy().reshape(ticks, 1)
-    mean, spread = np.empty(1), np.empty(1)
-    _moments(wanted, mean, spread)
-    error, square = np.empty((ticks, n)), np.zeros(n)
-    for t in range(ticks):
-        weight = 0.5 if t in (0, ticks - 1) else 1.0
-        for j in range(n):
-            e = phi_sp[t] - phi[t, j]
-            error[t, j] = e
-            square[j] += weight * e * e
-    off, left = np.empty(n), np.empty(n)
-    _moments(error, off, left)
-    x = phi_sp - np.mean(phi_sp)
-    y, column = np.empty(ticks), np.empty(ticks)
-    for j in range(n):
-        out[1, j] = math.degrees(math.sqrt(square[j] / (ticks - 1)))
-        out[0, j] = out[2, j] = out[3, j] = math.nan
-        if spread[0] < moves:
-            continue
-        out[0, j] = 100.0 * (1.0 - left[j] / spread[0])
-        for t in range(ticks):
-            column[t] = phi[t, j]
-        y[:] = column - np.mean(column)
-        lag = _lag_ticks(x, y, most_lag)
-        if not math.isnan(lag):
-            out[2, j] = lag * dt_s
-            out[3, j] = 100.0 * (1.0 - _unexplained(column, phi_sp, lag))
 
 
 def measure_step(phi: FloatArray, dt_s: float, phi_from_rad: float, phi_to_rad: float) -> FloatArray:

@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from queue import SimpleQueue
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from scenarios import batch_metrics as lanes
+from scenarios.batch_tracking import TRACK
 from scenarios.manoeuvres import EPSILON_S, Manoeuvre, Window
 from scenarios.metrics import effort_metrics, oscillation, step_metrics, track_metrics
 from scenarios.roll_set import RollSet, roll_sets
@@ -160,14 +163,16 @@ def monte_carlo(
     workers = threads or os.cpu_count() or 1
     with ThreadPoolExecutor(workers) as pool:
         found = pool.submit(_margins, derivatives, sets, lag_s) if margins else None
+        matrices = None
         for number, (manoeuvre, signal) in enumerate(zip(manoeuvres, signals, strict=True)):
             job = RollJob(
                 settings, derivatives, lag_s, profile.transport_delay_ticks, model.assumptions.hover_thrust, signal
             )
-            for block, values in _fly(Batch(job, compiled), manoeuvre, signal, profile.dt_s, pool, workers):
-                worst.add(block, values)
-                if kept is not None:
-                    kept.add(number, block)
+            batch = Batch(job, compiled, matrices)
+            matrices = batch.matrices
+            keep = None if kept is None else partial(kept.add, number)
+            for flown in _fly(batch, manoeuvre, signal, profile.dt_s, pool, workers, keep):
+                worst.add(flown)
         margin_arrays = found.result() if found is not None else None
     traces = None if kept is None else kept.traces
     return MonteCarlo(tuple(gains), derivatives, worst.metrics(), margin_arrays, worst.diverged, traces)
@@ -231,20 +236,41 @@ def _margins(derivatives: FloatArray, sets: Sequence[RollSet], lag_s: float) -> 
     )
 
 
-Values = list[tuple[Window, Mapping[str, FloatArray]]]
-"""Of one block: each window of the manoeuvre with its metrics, (n,) each."""
+@dataclass(frozen=True)
+class _Flown:
+    """What is left of a block: which pairs it was, (n,) each, which were lost, and the metrics of every window."""
+
+    gain_set: npt.NDArray[np.intp]
+    sample: npt.NDArray[np.intp]
+    lost: BoolArray
+    windows: list[Mapping[str, FloatArray]]
 
 
 def _fly(
-    batch: Batch, manoeuvre: Manoeuvre, signal: FloatArray, dt_s: float, pool: ThreadPoolExecutor, workers: int
-) -> Iterator[tuple[Block, Values]]:
+    batch: Batch,
+    manoeuvre: Manoeuvre,
+    signal: FloatArray,
+    dt_s: float,
+    pool: ThreadPoolExecutor,
+    workers: int,
+    keep: Callable[[Block], None] | None,
+) -> Iterator[_Flown]:
     """Blocks in order, a few ahead of the reader at a time: memory does not grow with the job."""
+    measure = _measure_lanes if batch.compiled else _measure_each
+    rooms: SimpleQueue[FloatArray] = SimpleQueue()
+    for _ in range(workers):
+        rooms.put(np.empty(batch.room))
 
-    def one(number: int) -> tuple[Block, Values]:
-        block = batch.fly(number)
-        measure = _measure_lanes if batch.compiled else _measure_each
-        values = [(window, measure(block, window, signal, dt_s)) for window in manoeuvre.windows]
-        return block, values
+    def one(number: int) -> _Flown:
+        room = rooms.get()
+        try:
+            block = batch.fly(number, room)
+            if keep is not None:
+                keep(block)
+            windows = [measure(block, window, signal, dt_s) for window in manoeuvre.windows]
+            return _Flown(block.gain_set, block.sample, block.lost, windows)
+        finally:
+            rooms.put(room)
 
     ahead = 2 * workers
     waiting = [pool.submit(one, n) for n in range(min(ahead, len(batch.blocks)))]
@@ -267,7 +293,7 @@ def _measure_lanes(block: Block, window: Window, signal: FloatArray, dt_s: float
         steps = lanes.measure_step(phi, dt_s, window.phi_from_rad, window.phi_to_rad)
         found |= dict(zip(lanes.STEP, steps, strict=True))
     elif window.kind == "track":
-        found |= dict(zip(lanes.TRACK, lanes.measure_track(phi, signal[rows], dt_s), strict=True))
+        found |= dict(zip(TRACK, lanes.measure_track(phi, signal[rows], dt_s), strict=True))
     if window.kind in ("step", "hold"):
         found["oscillation_rad_s"] = lanes.measure_oscillation(block.p_rad_s[rows], dt_s)
     return found | dict(zip(lanes.EFFORT, lanes.measure_effort(block.delta_lat[rows]), strict=True))
@@ -305,10 +331,10 @@ class _Worst:
         self._shape = (sets, samples)
         self.diverged: BoolArray = np.zeros(self._shape, dtype=bool)
 
-    def add(self, block: Block, values: Values) -> None:
-        place = block.gain_set, block.sample
-        self.diverged[place] |= block.lost
-        for _, metrics in values:
+    def add(self, flown: _Flown) -> None:
+        place = flown.gain_set, flown.sample
+        self.diverged[place] |= flown.lost
+        for metrics in flown.windows:
             for name, value in metrics.items():
                 if name not in self._values:
                     self._values[name] = np.full(self._shape, -math.inf)

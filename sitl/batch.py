@@ -222,15 +222,18 @@ class Batch:
     Args:
         job: what is flown.
         compiled: True or False to choose how; None lets the size of the job and the machine decide.
+        matrices: of `step_matrices` for the job's samples, where they are known already.
 
     Raises:
         UsageError: a gain set's settings have what the batch cannot fly.
     """
 
-    def __init__(self, job: RollJob, compiled: bool | None = None) -> None:
+    def __init__(self, job: RollJob, compiled: bool | None = None, matrices: FloatArray | None = None) -> None:
         self.job = job
         self.compiled = is_compiled(fly_lanes) or job.steps > COMPILE_STEPS if compiled is None else compiled
-        self._matrices = step_matrices(job.derivatives, job.motor_lag_s, float(job.settings["dt_s"][0]))
+        if matrices is None:
+            matrices = step_matrices(job.derivatives, job.motor_lag_s, float(job.settings["dt_s"][0]))
+        self.matrices = matrices
         self._gains = np.stack(
             [job.settings[name][:, 0] if job.settings[name].ndim > 1 else job.settings[name] for name in GAINS]
         )
@@ -245,16 +248,29 @@ class Batch:
                 pairs = np.arange(at, min(at + width, len(members) * samples))
                 self.blocks.append((first, members[pairs // samples], pairs % samples))
 
-    def fly(self, number: int) -> Block:
-        """Fly one of `blocks`."""
+    @property
+    def room(self) -> tuple[int, int, int]:
+        """Shape of the array that the largest block flies into."""
+        most = max(len(sample) for _, _, sample in self.blocks)
+        return 3, len(self.job.phi_sp_rad), LANES if self.compiled else most
+
+    def fly(self, number: int, room: FloatArray | None = None) -> Block:
+        """Fly one of `blocks`.
+
+        Args:
+            number: of the block.
+            room: of the shape `room`, to fly into; the block is then good until the next one flies into it. Fresh
+                memory for every block costs as much as half of the flying.
+        """
         job = self.job
         first, gain_set, sample = self.blocks[number]
         torque, count = self._torques[first], len(sample)
         # the last block is filled up with its own last pair
         lanes = np.minimum(np.arange(LANES if self.compiled else count), count - 1)
-        matrices = np.ascontiguousarray(np.moveaxis(self._matrices[sample[lanes]], 0, 2))
+        matrices = np.ascontiguousarray(np.moveaxis(self.matrices[sample[lanes]], 0, 2))
         gains = np.ascontiguousarray(self._gains[:, gain_set[lanes]])
-        out = np.empty((3, len(job.phi_sp_rad), len(lanes)))
+        shape = 3, len(job.phi_sp_rad), len(lanes)
+        out = np.empty(shape) if room is None or room.shape != shape else room
         lost = np.zeros(len(lanes), dtype=bool)
         settings = job.settings[first : first + 1]
         if self.compiled:

@@ -18,8 +18,9 @@ BoolArray = npt.NDArray[np.bool_]
 # A critical gain further than this from the present one (200 dB) is none.
 GAIN_RANGE = 1e10
 # Samples worked on together: what they need at once stays near the cache.
-_CHUNK = 128
+_CHUNK = 64
 _ROOT_STEPS = 60
+_LEAST_ROUNDS = 3
 
 
 class Loop(Protocol):
@@ -147,19 +148,31 @@ def _roots(function: Callable[[FloatArray, IndexArray], FloatArray], low: FloatA
 def least_of(
     loop: Loop, bracket: tuple[FloatArray, FloatArray], measure: Callable[[ComplexArray], FloatArray]
 ) -> FloatArray:
-    """Least value of a measure of L near the grid's own least, and at the ends of the band; (S,)."""
+    """Least value of a measure of L near the grid's own least, and at the ends of the band; (S,).
+
+    Args:
+        loop: all of them. bracket: (S,) each, rad/s. measure: of L, smooth at its least (a square of a distance).
+    """
     low, high = bracket
     samples = len(low)
     least = np.full(samples, math.inf)
     points = 9
     rows = np.repeat(np.arange(samples), points)
-    for _ in range(6):
+    for _ in range(_LEAST_ROUNDS):
         omega = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, points)
         value = measure(loop.values(omega.ravel(), rows)).reshape(samples, points)
         best = value.argmin(axis=1)
         column = np.arange(samples)
         least = np.minimum(least, value[column, best])
-        low, high = omega[column, np.maximum(best - 1, 0)], omega[column, np.minimum(best + 1, points - 1)]
+        inner = np.clip(best, 1, points - 2)
+        low, high = omega[column, inner - 1], omega[column, inner + 1]
+    # the parabola through the last three
+    before, middle, after = (value[column, inner + side] for side in (-1, 0, 1))
+    with np.errstate(all="ignore"):
+        share = 0.5 * (before - after) / (before - 2.0 * middle + after)
+    share = np.where(np.abs(share) <= 1.0, share, 0.0)
+    last = omega[column, inner] + share * 0.5 * (high - low)
+    least = np.minimum(least, measure(loop.values(last, column)))
     for end in loop.real_at():
         least = np.minimum(least, measure(loop.values(np.full(samples, end), np.arange(samples))))
-    return least
+    return np.asarray(least)

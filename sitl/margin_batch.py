@@ -147,9 +147,9 @@ def margins_of_loop(loop: Loop, samples: int) -> MarginArrays:
     stable = unstable == 0
     low, high, high_at = _gain_range(loop, found, stable)
     phase, delay = _phase_and_delay(found, unstable, loop.delay_s)
-    modulus = least_of(loop, found.nearest, lambda value: np.abs(1.0 + value))
     with np.errstate(all="ignore"):
-        inverse = least_of(loop, found.largest, lambda value: np.abs(1.0 + value) / np.abs(value))
+        modulus = np.sqrt(least_of(loop, found.nearest, lambda value: _square(1.0 + value)))
+        inverse = np.sqrt(least_of(loop, found.largest, lambda value: _square(1.0 + value) / _square(value)))
         low_db, high_db = 20.0 * np.log10(low), 20.0 * np.log10(high)
         peaks = 1.0 / modulus, 1.0 / inverse
     crossover = np.full(samples, math.nan)
@@ -167,6 +167,10 @@ def margins_of_loop(loop: Loop, samples: int) -> MarginArrays:
         crossover_rad_s=crossover,
         phase_crossover_rad_s=high_at,
     )
+
+
+def _square(value: ComplexArray) -> FloatArray:
+    return np.asarray(value.real**2 + value.imag**2)
 
 
 def _gain_range(

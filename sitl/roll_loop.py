@@ -29,6 +29,7 @@ LOST_RAD = math.radians(80.0)
 """Beyond this roll angle it is no flight any more: the sample is frozen and counts as diverged."""
 
 _PROBES, _TABLE = 161, 4001
+_TAYLOR = 15
 _MOST_TORQUE = 4.0
 """Torque set-points up to which the mix is probed: far beyond, nothing new happens."""
 
@@ -209,8 +210,6 @@ def step_matrices(derivatives: FloatArray, motor_lag_s: float, dt_s: float) -> F
     Returns:
         (S, 4, 6): rows v, p, phi, motor torque; columns the same four, the command, the excess of gravity (held).
     """
-    import scipy.linalg  # slow to import, and only a batch needs it
-
     count = len(derivatives)
     a = np.zeros((count, 6, 6))
     Yv, Yp, Yd, Lv, Lp, Ld = derivatives.T
@@ -221,7 +220,27 @@ def step_matrices(derivatives: FloatArray, motor_lag_s: float, dt_s: float) -> F
     a[:, 0, torque], a[:, 1, torque] = Yd, Ld
     if motor_lag_s > 0.0:
         a[:, 3, 3], a[:, 3, 4] = -1.0 / motor_lag_s, 1.0 / motor_lag_s
-    made: FloatArray = scipy.linalg.expm(a * dt_s)[:, :4, :]
+    made = _exponential(a * dt_s)[:, :4, :]
     if motor_lag_s <= 0.0:
         made[:, 3, :] = 0.0
     return made
+
+
+def _exponential(a: FloatArray) -> FloatArray:
+    """Exponentials of a stack of matrices, (S, n, n): Taylor's series of a / 2^k, squared k times.
+
+    With a norm of 1/2 at most, fifteen terms leave less than rounding does; for a stack of small matrices this is
+    several times as fast as one general exponential after the other.
+    """
+    norm = np.abs(a).sum(axis=1).max(axis=1)
+    # each matrix by itself: what a sample flies must not depend on its neighbours
+    halvings = np.maximum(0, np.ceil(np.log2(np.maximum(2.0 * norm, 1.0)))).astype(int)
+    a = a * (0.5**halvings)[:, None, None]
+    unit = np.eye(a.shape[-1])
+    total = unit + a / _TAYLOR
+    for n in range(_TAYLOR - 1, 0, -1):
+        total = unit + (a @ total) / n
+    for k in range(int(halvings.max(initial=0))):
+        rows = halvings > k
+        total[rows] = total[rows] @ total[rows]
+    return np.asarray(total)

@@ -170,7 +170,7 @@ class SampledLoop:
         elif den.ndim == 2:
             den, num = den[:, None, :], num[:, :, :, None, :]
         both = []
-        shift = lag**self.delay_ticks / _horner(den, w)
+        shift = (np.exp(-2j * self.delay_ticks * half) if self.delay_ticks else 1.0) / _horner(den, w)
         for signal in (0, 1):
             value = _horner(num[0, signal], w)
             if np.any(self.previous):
