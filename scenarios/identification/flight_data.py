@@ -36,12 +36,13 @@ class Excitation:
     """A multisine that was flown.
 
     Attributes:
-        start_s, end_s: vehicle time. frequencies_hz: (F,).
+        start_s, end_s: vehicle time. frequencies_hz: (F,). fade_s: at both ends, when it does not repeat.
     """
 
     start_s: float
     end_s: float
     frequencies_hz: FloatArray
+    fade_s: float = 1.0
 
 
 def excitation_of(manoeuvres: Sequence[Mapping[str, Any]], segments: Sequence[Segment], path: Path) -> Excitation:
@@ -59,8 +60,9 @@ def excitation_of(manoeuvres: Sequence[Mapping[str, Any]], segments: Sequence[Se
         name = str(manoeuvre.get("name", "multisine"))
         for segment in segments:
             if segment.manoeuvre == name and segment.kind == "track":
-                frequencies = np.array(manoeuvre["settings"]["frequencies_hz"], dtype=float)
-                return Excitation(segment.start_s, segment.end_s, frequencies)
+                flown = manoeuvre["settings"]
+                frequencies = np.array(flown["frequencies_hz"], dtype=float)
+                return Excitation(segment.start_s, segment.end_s, frequencies, float(flown["fade_s"]))
     raise FileError(
         path, "holds no multisine", 'Fly the scenario "identify", or one with a [[manoeuvre]] kind = "multisine"'
     )
@@ -101,9 +103,8 @@ def responses(telemetry: Telemetry, excitation: Excitation) -> LateralResponse:
     known = np.isfinite(p) & np.isfinite(delta) & np.isfinite(speed)
     t, p, delta, speed = t[known], p[known], delta[known], speed[known]
     period = period_of(excitation.frequencies_hz)
-    start = excitation.start_s + SETTLE_S
-    # the last second fades out
-    periods = math.floor((excitation.end_s - 1.0 - start) / period + 1e-9)
+    start = excitation.start_s + max(SETTLE_S, excitation.fade_s)
+    periods = math.floor((excitation.end_s - excitation.fade_s - start) / period + 1e-9)
     omega = 2.0 * math.pi * excitation.frequencies_hz
     phi, theta = (np.asarray(rows[name], dtype=float)[known] for name in ("phi_rad", "theta_rad"))
     signals = (delta, p, speed, phi, np.sin(phi) * np.cos(theta))

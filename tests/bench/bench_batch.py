@@ -73,7 +73,7 @@ def plain_sample(derivatives: np.ndarray, signals: list[np.ndarray]) -> tuple[fl
     Yv, Yp, Yd, Lv, Lp, Ld = derivatives
     dt = 1.0 / RATE_HZ
     plant = control.c2d(
-        control.ss([[Yv, Yp, 9.80665], [Lv, Lp, 0.0], [0.0, 1.0, 0.0]], [[Yd], [Ld], [0.0]], np.eye(3)[1:], [[0], [0]]),
+        control.ss([[Yv, Yp, 9.81], [Lv, Lp, 0.0], [0.0, 1.0, 0.0]], [[Yd], [Ld], [0.0]], np.eye(3)[1:], [[0], [0]]),
         dt,
     )
     plant.input_labels, plant.output_labels = ["delta"], ["p", "phi"]
