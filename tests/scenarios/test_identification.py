@@ -281,6 +281,8 @@ class TestFromAFlight:
         truth, made = load_airframe("adam-0"), load_airframe(file)
         assert made.name == "MINE"
         assert made.derivatives.as_array() == pytest.approx(truth.derivatives.as_array(), rel=0.03)
+        assert made.derivatives.as_array()[2:] == pytest.approx(truth.derivatives.as_array()[2:], rel=0.01)
+        assert made.derivatives.Ld == pytest.approx(truth.derivatives.Ld, rel=0.001)
         assert made.assumptions.motor_lag_s == pytest.approx(truth.assumptions.motor_lag_s, abs=5e-4)
         assert (made.mass_kg, made.rotors, made.flight_gains) == (truth.mass_kg, truth.rotors, truth.flight_gains)
         deviation = np.abs(made.derivatives.as_array() * made.sigma_pct.as_array() / 100.0)
