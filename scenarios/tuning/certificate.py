@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scenarios.tuning.channels import Channels
 from scenarios.tuning.synthesis import Synthesis, Vehicle
 from scenarios.tuning.weights import Weight
 from sitl.crossings import FloatArray
@@ -98,16 +99,16 @@ def _weighted(
     return whole, inputs, outputs, np.array([[b0 * d]])
 
 
-def worst_rows(vehicle: Vehicle, profile: Profile, gains: RollGains, count: int = 12) -> list[int]:
-    """The nominal model and the samples whose closed loop is nearest to instability or to resonance.
+def worst_rows(
+    vehicle: Vehicle, profile: Profile, gains: RollGains, weights: Sequence[Weight], count: int = 12
+) -> list[int]:
+    """The nominal model and the samples whose weighted channels are largest on a grid, of those that hold an angle.
 
     Args:
-        vehicle: with its samples. profile: fidelity. gains: of the roll axis. count: how many besides the nominal.
+        vehicle: with its samples. profile: fidelity. gains: of the roll axis. weights: W1, W2, W3.
+        count: how many besides the nominal, as many for each channel.
     """
-    from sitl.margin_batch import batch_margins
-
-    margins = batch_margins(vehicle.derivatives, [gains], profile, vehicle.lag_s)
-    half = count // 2
-    order = [*np.argsort(-margins.sensitivity_peak[0], kind="stable")[:half].tolist()]
-    order += np.argsort(-margins.complementary_peak[0], kind="stable")[: count - half].tolist()
-    return list(dict.fromkeys([0, *order]))
+    able = np.flatnonzero(vehicle.holds)
+    each = Channels(vehicle.derivatives[able], profile, vehicle.lag_s).each(gains, weights)
+    order = [able[np.argsort(-peaks, kind="stable")[: count // 3]].tolist() for peaks in each]
+    return list(dict.fromkeys([int(able[0]), *(row for rows in order for row in rows)]))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenarios.tuning.weights import Weight
-from sitl.crossings import FloatArray
+from sitl.crossings import ComplexArray, FloatArray
 from sitl.profile import Profile
 from sitl.sampled_loop import RollGains, SampledLoop
 
@@ -74,15 +74,32 @@ class Channels:
         shapes = [np.abs(weight.at(self.omega, self.dt_s)) for weight in weights]
         found = np.empty((4, len(gains)))
         for i, g in enumerate(gains):
-            error = g.kp + g.ki * self._per_ki
-            loop = (error * self._gyro + g.kd * self._slope) * self._p + (g.k_phi * error * self._attitude) * self._phi
-            q = (g.k_phi * error * self._late) / (1.0 + loop)
+            loop, q = self._closed(g)
             f = q * self._phi
             found[0, i] = (np.abs(1.0 - f) * shapes[0]).max()
             found[1, i] = (np.abs(q) * shapes[1]).max()
             found[2, i] = (np.abs(f) * shapes[2]).max()
             found[3, i] = self._delay_margin(loop)
         return Norms(*found)
+
+    def each(self, gains: RollGains, weights: Sequence[Weight]) -> FloatArray:
+        """The norms of one gain set on every model: (3, M) of |W1 S|, |W2 Q|, |W3 F|.
+
+        Args:
+            gains: with k = 1 and no feed-forward. weights: W1, W2, W3.
+        """
+        _, q = self._closed(gains)
+        f = q * self._phi
+        shapes = [np.abs(weight.at(self.omega, self.dt_s)) for weight in weights]
+        return np.stack(
+            [(np.abs(value) * shape).max(axis=1) for value, shape in zip((1.0 - f, q, f), shapes, strict=True)]
+        )
+
+    def _closed(self, g: RollGains) -> tuple[ComplexArray, ComplexArray]:
+        """L and Q of every model."""
+        error = g.kp + g.ki * self._per_ki
+        loop = (error * self._gyro + g.kd * self._slope) * self._p + (g.k_phi * error * self._attitude) * self._phi
+        return loop, (g.k_phi * error * self._late) / (1.0 + loop)
 
     def stable(self, gains: Sequence[RollGains]) -> FloatArray:
         """Largest spectral radius over the models; (K,). Below 1 every model is stable."""

@@ -12,6 +12,8 @@ from sitl.errors import UsageError
 class Requirements:
     """What a roll loop must do on every sample of its model.
 
+    The first three bound the search and decide what is met; the others shape its weights.
+
     Attributes:
         settling_time_s: last time outside 5 % of a roll step.
         overshoot_pct: of the step's amplitude.
@@ -35,9 +37,11 @@ class Requirements:
     def __post_init__(self) -> None:
         """Raise UsageError for a requirement that nothing can meet."""
         for name, value in asdict(self).items():
-            least = 0.0 if name in ("overshoot_pct", "delay_margin_s") else None
-            if math.isnan(value) or value < 0.0 or (least is None and value <= 0.0):
-                raise UsageError(f"requirement {name} = {value:g}: give a number above 0")
+            may_be_0 = name in ("overshoot_pct", "delay_margin_s")
+            endless = math.isinf(value) and name != "peak_delta_lat"
+            if math.isnan(value) or endless or value < 0.0 or (value == 0.0 and not may_be_0):
+                wanted = "0 or a number above it" if may_be_0 else "a number above 0"
+                raise UsageError(f"requirement {name} = {value:g}: give {wanted}")
         if self.settling_time_s < 0.05:
             raise UsageError(
                 f"requirement settling_time_s = {self.settling_time_s:g}: no multirotor settles within 0.05 s"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import shlex
 import sys
 from pathlib import Path
 
@@ -37,14 +38,13 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int) -> int
     """
     from scenarios.progress import spinner
     from scenarios.tuning.requirements import requirements_for
-    from scenarios.tuning.tuned_set import default_path, tuning_object, tuning_text, write_tuning
+    from scenarios.tuning.tuned_set import check_place, default_path, tuning_object, tuning_text, write_tuning
     from scenarios.tuning.tuning import tune
-    from sitl.errors import UsageError
     from sitl.profile import get_profile
     from sitl.vehicle_spec import resolve_vehicle
 
-    if args.out is not None and args.out.suffix != ".toml":
-        raise UsageError(f"--out {args.out}: the gain set is a .toml file; give it that ending")
+    if args.out is not None:
+        check_place(args.out)
     profile = get_profile(args.profile or "sitl")
     changes = {
         "settling_time_s": args.settling,
@@ -71,6 +71,12 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int) -> int
     else:
         sys.stdout.write(tuning_text(tuning) + "\n\n")
         sys.stdout.write(f"Written: {toml} and, for QGroundControl, {params}\n")
-        target = models[0].airframe.name.lower()
-        sys.stdout.write(f"Fly it: froude fly --vehicle {target} --gains {toml}\n")
+        words = ["froude", "fly", "--vehicle", _target(args.spec[0]), "--gains", str(toml)]
+        words += ["--profile", profile.name] if args.profile else []
+        sys.stdout.write(f"Fly it: {shlex.join(words)}\n")
     return EXIT_GATE if args.gate and not tuning.met else EXIT_OK
+
+
+def _target(spec: str) -> str:
+    """The true airframe of a spec: what a set made on a scaled model is flown on."""
+    return spec if Path(spec).is_file() else spec.rpartition(":")[2].strip()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from scenarios.run_folder import plain, write_atomically
 from scenarios.table import number
 from scenarios.toml_file import quoted
 from scenarios.tuning.tuning import Found, Tuning
-from sitl.errors import FileError
+from sitl.errors import FileError, UsageError
 from sitl.sampled_loop import RollGains
 
 SCHEMA_VERSION = 1
@@ -59,10 +60,31 @@ def _note(tuning: Tuning) -> str:
 
 
 def _line(found: Found) -> str:
+    models = found.samples - found.cannot_hold
     return (
-        f"{found.vehicle}, worst of {found.samples} models: settles {number(found.settling_s[0])} s, overshoot "
+        f"{found.vehicle}, worst of {models} models: settles {number(found.settling_s[0])} s, overshoot "
         f"{number(found.overshoot_pct[0], 1)} %, delay margin {number(1e3 * found.delay_margin_s, 1)} ms"
     )
+
+
+def check_place(path: Path) -> None:
+    """Whether a result can be written, better known before a long search than after it.
+
+    Args:
+        path: of the .toml.
+
+    Raises:
+        UsageError: another ending. FileError: a folder has that name, or a file or a lock is in the way.
+    """
+    if path.suffix != ".toml":
+        raise UsageError(f"--out {path}: the gain set is a .toml file; give it that ending")
+    if path.is_dir():
+        raise FileError(path, "is a folder", "Give the name of a file")
+    there = next(folder for folder in path.absolute().parents if folder.exists())
+    if not there.is_dir():
+        raise FileError(path, f"{there} is a file, not a folder", "Choose another place")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise FileError(path, f"nothing may be written into {there}", "Choose another place")
 
 
 def write_tuning(tuning: Tuning, path: Path) -> tuple[Path, Path]:
@@ -178,7 +200,8 @@ def tuning_text(tuning: Tuning) -> str:
     if any(not found.sure for found in tuning.found):
         lines.append("  An airframe states no uncertainty: its nominal model alone was looked at.")
     if tuning.unmet:
-        lines += ["", *(f"  not met: {text}" for text in tuning.unmet), f"  {tuning.limits}"]
+        lines += ["", *(f"  not met: {text}" for text in tuning.unmet)]
+        lines += [f"  {tuning.limits}"] if tuning.limits else []
     if tuning.trade_off:
         lines += ["", "  what can be had (worst sample):   settling s   overshoot %   delay margin ms"]
         for point in tuning.trade_off:

@@ -23,11 +23,13 @@ class Found:
 
     Attributes:
         vehicle: its name. samples: how many, the nominal among them. sure: the file states an uncertainty.
+        cannot_hold: samples that no gains can make hold a roll angle (`holds_an_angle`); all that follows but `meets`
+            is of the others.
         settling_s, overshoot_pct: worst and median over the samples; inf where one never settles or cycles.
+        never_settle: samples that do not settle while the step is held, cycle or diverge.
         delay_margin_s, phase_margin_deg, gain_margin_high_db, gain_margin_low_db: least over the samples (the low
-            one: nearest to 0 dB). stable: of all samples.
-        meets: share of the samples that meet every requirement.
-        cannot_hold: samples that no gains can make hold a roll angle (`holds_an_angle`).
+            one: nearest to 0 dB); -inf if one is unstable. stable: every one of them is.
+        meets: share of all samples that meet every requirement.
     """
 
     vehicle: str
@@ -35,6 +37,7 @@ class Found:
     sure: bool
     settling_s: tuple[float, float]
     overshoot_pct: tuple[float, float]
+    never_settle: int
     delay_margin_s: float
     phase_margin_deg: float
     gain_margin_high_db: float
@@ -50,7 +53,7 @@ class TradeOff:
 
     Attributes:
         asked_delay_margin_s: bound of the search. gains: found with it.
-        settling_s: worst over all samples of all vehicles. overshoot_pct, delay_margin_s: alike.
+        settling_s: worst over all samples of all vehicles that can hold an angle. overshoot_pct, delay_margin_s: alike.
     """
 
     asked_delay_margin_s: float
@@ -129,11 +132,12 @@ def tune(
     limits = ""
     if certified:
         progress("certificate")
+        gains, weights = synthesis.gains, synthesis.weights
         certificates = tuple(
-            certify(synthesis, vehicle, profile, worst_rows(vehicle, profile, synthesis.gains)) for vehicle in vehicles
+            certify(synthesis, vehicle, profile, worst_rows(vehicle, profile, gains, weights)) for vehicle in vehicles
         )
-    if certified and unmet:
-        trade_off = _trade_off(vehicles, profile, required, seed, progress)
+    if certified and any(len(_unmet(replace(one, cannot_hold=0), required)) for one in found):
+        trade_off = _trade_off(vehicles, profile, required, synthesis, seed, progress)
         limits = _limits(vehicles, profile)
     return Tuning(
         vehicles=tuple(model.name for model in models),
@@ -154,9 +158,10 @@ def tune(
 
 def _found(vehicle: Vehicle, checked: Checked, required: Requirements) -> Found:
     margins, trial = checked.margins, checked.trial
-    stable = margins.closed_loop_stable[0]
-    settling, overshoot = trial.settling_s[0], trial.overshoot_pct[0]
-    delay = margins.delay_margin_s[0]
+    holds = vehicle.holds
+    stable = margins.closed_loop_stable[0, holds]
+    settling, overshoot = trial.settling_s[0, holds], trial.overshoot_pct[0, holds]
+    delay = margins.delay_margin_s[0, holds]
     meets = (
         stable
         & (settling <= required.settling_time_s)
@@ -165,17 +170,18 @@ def _found(vehicle: Vehicle, checked: Checked, required: Requirements) -> Found:
     )
     return Found(
         vehicle=vehicle.model.name,
-        samples=len(stable),
-        sure=vehicle.model.airframe.has_sigma or len(stable) > 1,
+        samples=len(holds),
+        sure=vehicle.model.airframe.has_sigma or len(holds) > 1,
         settling_s=(float(settling.max()), float(np.median(settling))),
         overshoot_pct=(float(overshoot.max()), float(np.median(overshoot))),
+        never_settle=int(np.count_nonzero(np.isinf(settling))),
         delay_margin_s=_least(delay),
-        phase_margin_deg=_least(margins.phase_margin_deg[0]),
-        gain_margin_high_db=_least(margins.gain_margin_high_db[0]),
-        gain_margin_low_db=_largest(margins.gain_margin_low_db[0]),
+        phase_margin_deg=_least(margins.phase_margin_deg[0, holds]),
+        gain_margin_high_db=_least(margins.gain_margin_high_db[0, holds]),
+        gain_margin_low_db=_largest(margins.gain_margin_low_db[0, holds]),
         stable=bool(stable.all()),
-        meets=float(meets.mean()),
-        cannot_hold=int(np.count_nonzero(~vehicle.holds)),
+        meets=float(np.count_nonzero(meets) / len(holds)),
+        cannot_hold=int(np.count_nonzero(~holds)),
     )
 
 
@@ -199,14 +205,16 @@ def _unmet(found: Found, required: Requirements) -> list[str]:
         )
     if not found.stable:
         said.append(f"{found.vehicle}: unstable on some samples")
+    models = found.samples - found.cannot_hold
     for what, value, bound, unit in (
         ("settling time", found.settling_s[0], required.settling_time_s, "s"),
         ("overshoot", found.overshoot_pct[0], required.overshoot_pct, "%"),
     ):
         if value > bound:
-            shown = "never on some samples" if math.isinf(value) else f"{value:.3g} {unit}"
+            never = f"not seen to end on {found.never_settle} of {models} models"
+            shown = never if math.isinf(value) else f"{value:.3g} {unit}"
             said.append(f"{found.vehicle}: {what} {shown}, required {bound:g} {unit}")
-    if found.delay_margin_s < required.delay_margin_s:
+    if found.stable and found.delay_margin_s < required.delay_margin_s:
         said.append(
             f"{found.vehicle}: delay margin {1e3 * found.delay_margin_s:.1f} ms, "
             f"required {1e3 * required.delay_margin_s:g} ms"
@@ -218,34 +226,35 @@ def _trade_off(
     vehicles: Sequence[Vehicle],
     profile: Profile,
     required: Requirements,
+    made: Synthesis,
     seed: int,
     progress: Callable[[str], object],
 ) -> tuple[TradeOff, ...]:
-    """The fastest settling found for a falling delay margin, points that are worse in both left out."""
-    points = []
-    asked = max(required.delay_margin_s, 0.010)
+    """What is found for a falling delay margin, points left out that another one is as good as in both."""
+    points = [_point(vehicles, required.delay_margin_s, made)]
+    # a margin far beyond what can be had would only be asked for in vain, again and again
+    asked = max(min(required.delay_margin_s, points[0].delay_margin_s), 0.010)
     for share in (1.5, 1.0, 0.75, 0.5, 0.25, 0.0):
         progress(f"trade-off: delay margin {1e3 * asked * share:.0f} ms")
         loose = replace(required, delay_margin_s=asked * share)
-        one = synthesise(vehicles, profile, loose, seed=seed)
-        points.append(
-            TradeOff(
-                asked_delay_margin_s=asked * share,
-                gains=one.gains,
-                settling_s=max(float(c.trial.settling_s.max()) for c in one.checked),
-                overshoot_pct=max(float(c.trial.overshoot_pct.max()) for c in one.checked),
-                delay_margin_s=min(_least(c.margins.delay_margin_s[0]) for c in one.checked),
-            )
-        )
-    return tuple(
-        point
-        for point in points
-        if not any(
-            (other.settling_s, -other.delay_margin_s) != (point.settling_s, -point.delay_margin_s)
-            and other.settling_s <= point.settling_s
-            and other.delay_margin_s >= point.delay_margin_s
-            for other in points
-        )
+        found = synthesise(vehicles, profile, loose, seed=seed, starts=1, push=1.0, firm=True, near=points[-1].gains)
+        points.append(_point(vehicles, asked * share, found))
+    kept: list[TradeOff] = []
+    for point in sorted(points, key=lambda one: (-one.delay_margin_s, one.settling_s, one.overshoot_pct)):
+        if not kept or point.settling_s < kept[-1].settling_s:
+            kept.append(point)
+    return tuple(kept)
+
+
+def _point(vehicles: Sequence[Vehicle], asked_s: float, one: Synthesis) -> TradeOff:
+    """The worst over all samples that can hold an angle."""
+    each = list(zip(vehicles, one.checked, strict=True))
+    return TradeOff(
+        asked_delay_margin_s=asked_s,
+        gains=one.gains,
+        settling_s=max(float(c.trial.settling_s[0, v.holds].max()) for v, c in each),
+        overshoot_pct=max(float(c.trial.overshoot_pct[0, v.holds].max()) for v, c in each),
+        delay_margin_s=min(_least(c.margins.delay_margin_s[0, v.holds]) for v, c in each),
     )
 
 

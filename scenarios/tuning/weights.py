@@ -67,19 +67,17 @@ class Weight:
         return f"{self.name} = ({line(self.a, self.b)}) / ({line(self.c, self.d)})"
 
 
-def weights_for(requirements: Requirements, tighter: float = 1.0) -> tuple[Weight, Weight, Weight]:
+def weights_for(requirements: Requirements) -> tuple[Weight, Weight, Weight]:
     """(W1, W2, W3).
 
     Args:
         requirements: what they stand for.
-        tighter: 1 as required; above it, faster and less resonant than required by this factor: the outer loop of
-            the synthesis asks for more until every sample does enough.
     """
     # 5 % of a step are left after settling: exp(-w t) = 0.05, unless the natural frequency asks for more
-    speed = max(3.0 / requirements.settling_time_s, 0.5 * requirements.natural_frequency_rad_s) * tighter
+    speed = max(3.0 / requirements.settling_time_s, 0.5 * requirements.natural_frequency_rad_s)
     peak = requirements.peak_sensitivity
-    resonance = max(_peak_of(requirements.damping), 1.0 + requirements.overshoot_pct / 100.0 / tighter)
-    roll_off = 6.0 * requirements.natural_frequency_rad_s * tighter
+    resonance = max(_peak_of(requirements.damping), 1.0 + requirements.overshoot_pct / 100.0)
+    roll_off = 6.0 * requirements.natural_frequency_rad_s
     most = requirements.peak_delta_lat / math.radians(requirements.amplitude_deg)
     limit = _DEFAULT_LIMIT if math.isinf(most) else most
     return (
