@@ -322,6 +322,7 @@ class Client:
             q=quat,
             thrust=thrust,
         )
+        self.drive.sent_setpoint(quat)
 
     # -- parameters --------------------------------------------------------------------------------------------
 

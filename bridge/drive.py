@@ -47,6 +47,14 @@ class Drive(ABC):
         """Whether `now_us` means something yet."""
         return True
 
+    def sent_setpoint(self, quat: tuple[float, float, float, float]) -> None:
+        """An attitude set-point was sent.
+
+        Args:
+            quat: body to world, w first.
+        """
+        return
+
 
 class SharedDrive(Drive):
     """The vehicle lives in this thread: every wait is one of its ticks.

@@ -164,12 +164,34 @@ class TcpLink(Link):
         self._peer = peer
         return peer
 
+    def turn_away(self) -> bool:
+        """Close the connections of those who came while there is a peer; whether there were any."""
+        if self._listener is None or self._peer is None:
+            return False
+        anybody = False
+        while True:
+            try:
+                other, _ = self._listener.accept()
+            except OSError:
+                return anybody
+            other.close()
+            anybody = True
+
     def _parted(self, why: str) -> PeerLost:
         if self._peer is not None:
             self._peer.close()
             self._peer = None
         self._lost = why
         return PeerLost(self.name, why)
+
+
+def refuse_others(link: Link) -> bool:
+    """Turn away whoever else has connected to a listening link that has its peer; whether anybody had.
+
+    Args:
+        link: of any kind.
+    """
+    return isinstance(link, TcpLink) and link.turn_away()
 
 
 def _at_once(sock: socket.socket) -> None:

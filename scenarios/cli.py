@@ -7,18 +7,12 @@ import dataclasses
 import json
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import NoReturn
 
-from scenarios import analyse_command, sitl_command
+from scenarios import analyse_command, fly_command, sitl_command
 from scenarios.identification import identify_command
 from scenarios.study import study_command
 from scenarios.tuning import tune_command
-
-if TYPE_CHECKING:
-    from scenarios.runner import Progress, RunResult
-    from scenarios.scenario import Scenario
 
 EXIT_OK, EXIT_GATE, EXIT_USAGE, EXIT_LINK, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -60,25 +54,8 @@ def _parser() -> argparse.ArgumentParser:
         "Upload gain sets, fly manoeuvres, say which sets pass.",
         "froude fly --vehicle ant-x --gains table_7_2 table_2_2/ANT-X",
     )
-    library = ", ".join(_names("library"))
-    sub.add_argument("scenario", nargs="?", default="demo", help=f"a .toml file, or one of {library} (default: demo)")
-    sub.add_argument("--vehicle", metavar="SPEC", help="airframe, or reference:target")
+    fly_command.add_arguments(sub)
     _vehicle_options(sub)
-    sub.add_argument(
-        "--gains",
-        nargs="+",
-        metavar="NAME|FILE",
-        help=f"a .toml or .params file, or {', '.join(_names('gain_sets'))}; one set of a file as table_2_2/ANT-X",
-    )
-    sub.add_argument("--connect", metavar="URL", help="fly this vehicle, such as udpin://127.0.0.1:14540")
-    sub.add_argument("--arm-hardware", action="store_true", help="allow arming on a serial link: propellers may turn")
-    sub.add_argument("--seed", type=int, metavar="N", help="of sensor noise")
-    sub.add_argument("--jobs", type=int, default=1, metavar="N", help="flights at a time (default: 1)")
-    sub.add_argument("--live", action="store_true", help="serve a Rerun viewer on 127.0.0.1 while flying")
-    sub.add_argument("--out", type=Path, default=Path("logs"), metavar="DIR", help="where run folders go (logs)")
-    sub.add_argument("--json", action="store_true", help="print run.json instead of the table")
-    sub.add_argument("--junit", type=Path, metavar="FILE", help="also write JUnit XML here")
-    sub.add_argument("--gate", action="store_true", help="exit status 1 unless every set passes")
 
     sub = add("sitl", _sitl, "Serve simulated vehicles to any ground station.", "froude sitl ant-x ant-r --speed 2")
     sitl_command.add_arguments(sub)
@@ -113,11 +90,6 @@ def _parser() -> argparse.ArgumentParser:
     sub = add("study", _study, "Recompute the study: every table, figure and conclusion.", "froude study --tune")
     study_command.add_arguments(sub)
     return parser
-
-
-def _names(folder: str) -> list[str]:
-    """Names of the .toml files in a folder of this package."""
-    return sorted(path.stem for path in (Path(__file__).parent / folder).glob("*.toml"))
 
 
 def _vehicle_options(parser: argparse.ArgumentParser) -> None:
@@ -158,7 +130,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _tell("interrupted", EXIT_INTERRUPTED)
     except BrokenPipeError:
         # the reader of our output went away (froude model ... | head): nothing is wrong, and nothing can be told
-        _mute_stdout()
+        fly_command.mute_stdout()
         return EXIT_OK
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
@@ -169,14 +141,6 @@ def _tell(text: str, status: int = EXIT_OK) -> int:
     if sys.stderr is not None:  # None: closed by whoever started us, and print would write to stdout instead
         print(f"froude: {text}", file=sys.stderr, flush=True)
     return status
-
-
-def _tell_of_compiling() -> None:
-    """The first flight of a version takes longer: say so before it."""
-    from sitl.compiled import is_warm
-
-    if not is_warm():
-        _tell("compiling the control laws, once; up to half a minute ...")
 
 
 def _words(text: str | None, default: tuple[str, ...]) -> tuple[str, ...]:
@@ -216,24 +180,6 @@ def _model(args: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-def _scenario(args: argparse.Namespace) -> Scenario:
-    from scenarios.scenario import load_scenario
-
-    scenario = load_scenario(args.scenario)
-    changes: dict[str, Any] = {}
-    if args.vehicle:
-        changes["vehicle"] = args.vehicle
-    if args.scaling is not None:
-        changes["scaling"] = _words(args.scaling, ())
-    if args.profile:
-        changes["profile"] = args.profile
-    if args.gains:
-        changes["gain_sets"] = tuple(args.gains)
-    if args.seed is not None:
-        changes["seed"] = _seed(args)
-    return dataclasses.replace(scenario, **changes)
-
-
 def _seed(args: argparse.Namespace) -> int:
     from sitl.errors import UsageError
 
@@ -243,125 +189,8 @@ def _seed(args: argparse.Namespace) -> int:
 
 
 def _fly(args: argparse.Namespace) -> int:
-    import os
-
-    from scenarios import interrupts
-    from scenarios.one_flight import MEMORY
-    from scenarios.progress import RunWatch
-    from scenarios.runner import RunOptions, run_scenario
-
-    _check_junit(args.junit)
-    scenario = _scenario(args)
-    options = RunOptions(
-        out=args.out,
-        connect=args.connect or MEMORY,
-        arm_hardware=args.arm_hardware,
-        jobs=args.jobs,
-        live_port=_live_port() if args.live else None,
-        command=("froude", *args.argv),
-    )
-    # Rerun's own log lines come from other threads, right through the table; what they say we find out ourselves.
-    os.environ.setdefault("RUST_LOG", "off")
-
-    def begin() -> None:
-        if options.live_port is not None:
-            _tell(f"live view: rerun --connect rerun+http://127.0.0.1:{options.live_port}/proxy")
-        _tell_of_compiling()
-
-    watch = RunWatch(begin)
-
-    def stopping() -> None:
-        if args.connect and watch.touched:
-            _tell("stopping: the vehicle lands and gets its parameters back; Ctrl-C again leaves it as it is")
-
-    with interrupts.caught(stopping):
-        with _progress_bar() as watch.show:
-            result = run_scenario(scenario, options, watch)
-        return _report(args, result)
-
-
-def _check_junit(path: Path | None) -> None:
-    """Better now than after an hour of flying."""
-    from sitl.errors import FileError
-
-    if path is not None and not path.parent.is_dir():
-        raise FileError(path, "its folder does not exist", "Make the folder, or write --junit to another place")
-
-
-def _report(args: argparse.Namespace, result: RunResult) -> int:
-    """Print the result; the exit status that it means."""
-    from scenarios.limits import Outcome
-    from scenarios.run_folder import RunFolder, run_object
-    from scenarios.table import run_text, terminal_width
-    from sitl.errors import FroudeError
-
-    run, folder = result.run, result.folder
-    if args.json:
-        shown = run_object(run, RunFolder(folder) if folder else None, ("froude", *args.argv))
-        text = json.dumps(shown, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    else:
-        width, colour = terminal_width(sys.stdout)
-        text = run_text(run, folder, width=width, colour=colour)
-    unread = _show(text)
-    stopped = result.stopped or unread
-    if args.junit is not None:
-        from scenarios.junit import write_junit
-
-        try:
-            write_junit(run, args.junit)
-        except FroudeError as error:
-            stopped = stopped or error
-    if stopped is not None:
-        what, status = "interrupted", EXIT_INTERRUPTED
-        if not isinstance(stopped, KeyboardInterrupt):
-            what, status = str(stopped), getattr(stopped, "exit_status", EXIT_LINK)
-        kept = f"What was flown is in {folder}" if folder is not None else ""
-        return _tell(". ".join(part for part in (what, result.owed, kept) if part), status)
-    if args.gate and any(flight.outcome is not Outcome.PASS for flight in run.flights):
-        return EXIT_GATE
-    return EXIT_OK
-
-
-def _show(text: str) -> Exception | None:
-    """Print a result; what went wrong, but a reader that went away (froude fly | head) is no trouble."""
-    from sitl.errors import FileError
-
-    try:
-        if sys.stdout is not None:
-            sys.stdout.write(text)
-            sys.stdout.flush()
-    except BrokenPipeError:
-        _mute_stdout()
-    except OSError as error:
-        _mute_stdout()
-        return FileError("standard output", f"cannot be written: {error.strerror}", "The result is in run.json")
-    return None
-
-
-def _mute_stdout() -> None:
-    """Let Python's own flush at exit go nowhere instead of failing."""
-    import os
-
-    null = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, sys.stdout.fileno())
-    os.close(null)
-
-
-def _live_port() -> int:
-    import socket
-
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def _progress_bar() -> AbstractContextManager[Callable[[Progress], object]]:
-    """A bar on a terminal, nothing elsewhere."""
-    if sys.stderr is None or not sys.stderr.isatty():
-        return nullcontext(lambda _: None)
-    from scenarios.progress import progress_bar
-
-    return progress_bar()
+    scaling = None if args.scaling is None else _words(args.scaling, ())
+    return fly_command.run(args, scaling=scaling, seed=None if args.seed is None else _seed(args), tell=_tell)
 
 
 def _sitl(args: argparse.Namespace) -> int:

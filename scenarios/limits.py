@@ -57,6 +57,7 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "phase_margin_deg": ("deg", "of the loop broken at delta_lat"),
     "delay_margin_s": ("s", "extra delay that makes the loop unstable"),
     "modulus_margin": ("1", "least distance of the loop from -1"),
+    "roll_estimate_error_deg": ("deg", "largest difference between estimated and true roll in a segment"),
     "attitude_rate_hz": ("Hz", "ATTITUDE messages per second of vehicle time, as received"),
     "largest_gap_s": ("s", "longest time between two ATTITUDE messages"),
 }
@@ -84,6 +85,7 @@ TITLES: Mapping[str, str] = {
     "phase_margin_deg": "phase margin",
     "delay_margin_s": "delay margin",
     "modulus_margin": "modulus margin",
+    "roll_estimate_error_deg": "roll estimate error",
     "attitude_rate_hz": "ATTITUDE rate",
     "largest_gap_s": "largest gap",
 }

@@ -25,6 +25,7 @@ from scenarios import interrupts, sampler
 from scenarios.flight import Event, FlightRecord
 from scenarios.flight_files import FlightFiles
 from scenarios.gain_set import GainSet
+from scenarios.hil_session import HilSession
 from scenarios.limits import Outcome, judge
 from scenarios.pilot import FlightLog, Pilot
 from scenarios.sampler import Sampler
@@ -116,11 +117,14 @@ class FlightStoppedError(Exception):
         return FlightStoppedError, (self.record, self.cause, self.owed)
 
 
-def fly(job: FlightJob, progress: Callable[[str], object] = lambda _: None) -> FlightRecord:
+def fly(
+    job: FlightJob, progress: Callable[[str], object] = lambda _: None, session: HilSession | None = None
+) -> FlightRecord:
     """Fly one job.
 
     Args:
         job: what to fly. progress: called with a short text at every phase.
+        session: a real autopilot on our plant, already open; without one the job's own link is opened.
 
     Returns:
         the record, scored.
@@ -129,7 +133,7 @@ def fly(job: FlightJob, progress: Callable[[str], object] = lambda _: None) -> F
         FlightStoppedError: the link died, a parameter was refused, a file could not be written, or Ctrl-C; carries
             the record so far.
     """
-    flight = _Flight(job, progress)
+    flight = _Flight(job, progress, session)
     try:
         flight.run()
     except (FroudeError, KeyboardInterrupt) as cause:
@@ -161,8 +165,9 @@ def _spare_the_collector() -> None:
 class _Flight:
     """The moving parts of one flight."""
 
-    def __init__(self, job: FlightJob, progress: Callable[[str], object]) -> None:
+    def __init__(self, job: FlightJob, progress: Callable[[str], object], session: HilSession | None) -> None:
         self._job = job
+        self._session = session
         self._progress = progress
         self._stack = ExitStack()
         self._events: list[Event] = []
@@ -196,7 +201,7 @@ class _Flight:
         client.make_ready(_READY_TIMEOUT_S)
         if client.state.armed:
             raise AlreadyArmed(client.link.name)
-        pilot = Pilot(client, job.scenario, self._say(client), self._progress)
+        pilot = Pilot(client, job.scenario, self._say(client), self._progress, self._sampled)
         self._log = pilot.log
         try:
             self._upload(client)
@@ -209,7 +214,7 @@ class _Flight:
         """Land, restore, leave the streams as they were: each is tried even if the one before failed."""
         trouble: LinkError | None = None
         steps: list[Callable[[], object]] = [
-            lambda: pilot.come_down(may_force=self._job.in_memory),
+            lambda: pilot.come_down(may_force=self._job.in_memory or self._session is not None),
             lambda: self._restore(client),
             lambda: self._default_streams(client),
         ]
@@ -230,7 +235,10 @@ class _Flight:
         job = self._job
         link: Link
         drive: Drive
-        if job.in_memory:
+        session = self._session
+        if session is not None:
+            link, drive = session.link, session.drive
+        elif job.in_memory:
             vehicle = Vehicle(job.model, job.profile, seed=job.scenario.seed)
             clock = SimClock(vehicle.tick_us)
             link, far = MemoryLink.pair()
@@ -239,19 +247,29 @@ class _Flight:
             drive = SharedDrive(clock)
         else:
             link, drive = open_link(job.connect), NetworkDrive(job.patience_s)
-        self._stack.callback(link.close)
+        if session is None:
+            self._stack.callback(link.close)
         files = self._files
         client = Client(link, drive, log=files.frame if files else None)
         inverse = mix_of(job.flown_table()).inverse[:2]
         self._sampler = Sampler(client, inverse, files.rows if files else None, rows_per_batch=job.rows_per_batch)
+        if session is not None:
+            self._sampler.truth_at = session.truth_at
         return client
 
     def _set_streams(self, client: Client) -> None:
         for message_id, interval_us in _INTERVALS_US.items():
-            client.try_interval(message_id, interval_us)
+            if message_id in self._sampled or message_id not in sampler.SAMPLED:
+                client.try_interval(message_id, interval_us)
         if self._job.in_memory:
             for message_id in _UNUSED_STREAMS:
                 client.set_interval(message_id, -1)
+
+    @property
+    def _sampled(self) -> tuple[int, ...]:
+        """What is streamed fast; a plant of ours tells its own truth, tick by tick."""
+        own = self._session is not None
+        return tuple(one for one in sampler.SAMPLED if not (own and one in sampler.SIMULATORS))
 
     def _upload(self, client: Client) -> None:
         self._progress("upload")
@@ -325,6 +343,11 @@ class _Flight:
         outcome, reason, metrics = judge(metrics, job.scenario.limits, failure)
         if stopped is not None and not log.failure:
             outcome = Outcome.UNSET
+        notes = list(log.notes)
+        if self._session is not None:
+            notes.append(self._session.summary())
+            if not self._session.report.valid:
+                outcome, reason = Outcome.UNSET, "invalid: " + "; ".join(self._session.report.faults or ())
         record = FlightRecord(
             gain_set=job.gain_set,
             vehicle_spec=job.model.spec,
@@ -335,7 +358,7 @@ class _Flight:
             margins=margins,
             outcome=outcome,
             reason=reason,
-            warnings=(*job.warnings, *log.notes),
+            warnings=(*job.warnings, *notes),
             telemetry_sha256=telemetry.sha256(),
             seed=job.scenario.seed,
             parameters={name: value for name, (value, _) in job.parameters.items()},

@@ -8,7 +8,7 @@ level, still and at height.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -64,6 +64,7 @@ class Pilot:
         scenario: what to fly.
         say: called with (severity, text) for the event log.
         progress: called with a short text at every phase.
+        sampled: ids of the messages that are wanted fast while something is measured.
     """
 
     def __init__(
@@ -72,7 +73,9 @@ class Pilot:
         scenario: Scenario,
         say: Callable[[int, str], object],
         progress: Callable[[str], object],
+        sampled: Sequence[int] = SAMPLED,
     ) -> None:
+        self._sampled = sampled
         self._client = client
         self._scenario = scenario
         self._say = say
@@ -194,7 +197,7 @@ class Pilot:
             raise FlightEndedError("the vehicle accepted Offboard and did not enter it")
 
     def _sample_every(self, interval_us: int) -> None:
-        for message_id in SAMPLED:
+        for message_id in self._sampled:
             self._client.try_interval(message_id, interval_us)
 
     def _gate(self, manoeuvre: Manoeuvre) -> None:

@@ -27,7 +27,7 @@ from sitl.errors import FileError
 if TYPE_CHECKING:
     from sitl.vehicle_spec import VehicleModel
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 RUN_JSON = "run.json"
 FLIGHT_SUFFIXES = (".rrd", ".partial.rrd", ".parquet", ".tlog", ".partial.tlog", ".params", ".backup.params")
 

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import get_context
 from pathlib import Path
@@ -15,7 +15,9 @@ from pathlib import Path
 from bridge.clock import utc_stamp
 from scenarios import interrupts
 from scenarios.flight import FlightRecord, RunRecord
+from scenarios.flown import Flown, Progress
 from scenarios.gain_set import GainSet, check, flies_gains, flight_gain_parameters, load_all
+from scenarios.hil_session import geometry_parameters
 from scenarios.one_flight import MEMORY, FlightJob, FlightStoppedError, fly
 from scenarios.run_folder import RunFolder, vehicle_description
 from scenarios.scenario import Scenario
@@ -24,6 +26,8 @@ from sitl.parameters import ParameterTable, ParameterType
 from sitl.profile import Profile
 from sitl.vehicle import airframe_parameters
 from sitl.vehicle_spec import VehicleModel
+
+__all__ = ["Progress", "RunOptions", "RunResult", "plan", "run_scenario", "versions"]
 
 LIBRARIES = ("numpy", "scipy", "numba", "control", "pymavlink", "pyarrow", "rerun-sdk")
 
@@ -39,6 +43,9 @@ class RunOptions:
         jobs: flights at a time; more than one only for vehicles of our own.
         live_port: port that serves viewers while flying; None for none.
         command: as typed, for run.json.
+        hil: simulator link on which a real autopilot flies our plant, `tcpin://127.0.0.1:4560`; empty for none.
+        px4: build directory of a PX4 that is started for every flight; None for none.
+        say: called with a line for people.
     """
 
     out: Path | None = Path("logs")
@@ -47,6 +54,9 @@ class RunOptions:
     jobs: int = 1
     live_port: int | None = None
     command: tuple[str, ...] = ()
+    hil: str = ""
+    px4: Path | None = None
+    say: Callable[[str], object] = lambda _: None
 
     def __post_init__(self) -> None:
         """Raise UsageError for options that exclude each other, before anything is read."""
@@ -55,6 +65,15 @@ class RunOptions:
                 f"--connect {self.connect}: a serial link leads to real hardware, and nothing is armed there without "
                 "--arm-hardware. Take the propellers off first"
             )
+        if self.px4 is not None and (self.hil or self.connect != MEMORY):
+            raise UsageError("--px4 starts an autopilot with ports of its own: leave out --hil and --connect")
+        if self.hil and self.connect == MEMORY:
+            raise UsageError(
+                f"--hil {self.hil}: say also where the autopilot's MAVLink arrives, such as "
+                "--connect udpin://127.0.0.1:14540"
+            )
+        if self.jobs > 1 and self.is_hil:
+            raise UsageError("--jobs above 1 needs vehicles of our own: with --hil or --px4 fly one at a time")
         if self.jobs < 1:
             raise UsageError(f"--jobs {self.jobs}: give 1 or more")
         if self.jobs > 1 and self.connect != MEMORY:
@@ -62,15 +81,10 @@ class RunOptions:
         if self.jobs > 1 and self.live_port is not None:
             raise UsageError("--live shows one flight at a time: leave out --jobs, or --live")
 
-
-@dataclass(frozen=True)
-class Progress:
-    """Where a run is: flight `index` of `count`, in `phase`."""
-
-    index: int
-    count: int
-    name: str
-    phase: str
+    @property
+    def is_hil(self) -> bool:
+        """A real autopilot flies our plant."""
+        return bool(self.hil) or self.px4 is not None
 
 
 @dataclass(frozen=True)
@@ -86,15 +100,6 @@ class RunResult:
 
     run: RunRecord
     folder: Path | None
-    stopped: BaseException | None = None
-    owed: str = ""
-
-
-@dataclass
-class _Flown:
-    """What came back from the flights: record by job number, and what stopped them."""
-
-    records: dict[int, FlightRecord] = field(default_factory=dict)
     stopped: BaseException | None = None
     owed: str = ""
 
@@ -129,11 +134,12 @@ def run_scenario(
             job,
             folder=folder.path / "flights" if folder else None,
             connect=options.connect,
+            parameters={**(geometry_parameters(model) if options.is_hil else {}), **job.parameters},
             live_port=options.live_port,
         )
         for job in (*candidates, *([baseline] if baseline else []))
     ]
-    flown = _fly_all(jobs, options.jobs, progress)
+    flown = _fly_real(jobs, options, progress) if options.is_hil else _fly_all(jobs, options.jobs, progress)
     records, stopped = flown.records, flown.stopped
     if stopped is not None:
         records = {index: record for index, record in records.items() if len(record.telemetry)}
@@ -215,10 +221,16 @@ def _baseline(
     return plan(gain_set, scenario, model, profile)
 
 
-def _fly_all(jobs: Sequence[FlightJob], workers: int, progress: Callable[[Progress], object]) -> _Flown:
+def _fly_real(jobs: Sequence[FlightJob], options: RunOptions, progress: Callable[[Progress], object]) -> Flown:
+    from scenarios.hil_flights import fly_with_autopilot
+
+    return fly_with_autopilot(jobs, hil=options.hil, px4=options.px4, say=options.say, progress=progress)
+
+
+def _fly_all(jobs: Sequence[FlightJob], workers: int, progress: Callable[[Progress], object]) -> Flown:
     if workers > 1 and len(jobs) > 1:
         return _fly_side_by_side(jobs, workers, progress)
-    flown = _Flown()
+    flown = Flown()
     for index, job in enumerate(jobs):
         name = job.gain_set.name
         try:
@@ -236,9 +248,9 @@ def _fly_all(jobs: Sequence[FlightJob], workers: int, progress: Callable[[Progre
     return flown
 
 
-def _fly_side_by_side(jobs: Sequence[FlightJob], workers: int, progress: Callable[[Progress], object]) -> _Flown:
+def _fly_side_by_side(jobs: Sequence[FlightJob], workers: int, progress: Callable[[Progress], object]) -> Flown:
     """In processes of their own; when something stops the run, flights that have begun are flown to their end."""
-    flown = _Flown()
+    flown = Flown()
     # spawn: a forked child of a process that has started Arrow's or Rerun's threads may hang
     pool = ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn"))
     flights: dict[Future[FlightRecord], int] = {}
@@ -264,7 +276,7 @@ def _fly_side_by_side(jobs: Sequence[FlightJob], workers: int, progress: Callabl
     return flown
 
 
-def _collect(flight: Future[FlightRecord], index: int, flown: _Flown) -> None:
+def _collect(flight: Future[FlightRecord], index: int, flown: Flown) -> None:
     try:
         flown.records[index] = flight.result()
     except FlightStoppedError as stop:

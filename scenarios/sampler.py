@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,14 +25,30 @@ CURRENT_MODE = 436
 
 SAMPLED = (ATTITUDE, ATTITUDE_TARGET, HIL_ACTUATOR_CONTROLS, HIL_STATE_QUATERNION)
 """What a row is made of, streamed fast while something is measured and slower on the way there and back."""
+SIMULATORS = (HIL_ACTUATOR_CONTROLS, HIL_STATE_QUATERNION)
+"""Those of them that only a simulated vehicle has."""
+
 FAST_INTERVAL_US = 4_000
 CRUISE_INTERVAL_US = 20_000
 
 ROWS_PER_BATCH = 1000
 _MOTORS_SHOWN = 8
-_FIXED_VALUES = 7 + 8 + 6 + 2
+_FIXED_VALUES = 7 + 8 + 6 + 2 + 4
 _NAN3 = (float("nan"),) * 3
+_NAN4 = (float("nan"),) * 4
 _NAN8 = (float("nan"),) * 8
+
+
+class Truth(NamedTuple):
+    """What the plant really did in a tick.
+
+    Attributes:
+        quat: body to world, w first. rates: p, q, r, rad/s. motors: commands, 0 to 1.
+    """
+
+    quat: tuple[float, float, float, float]
+    rates: tuple[float, float, float]
+    motors: tuple[float, ...]
 
 
 class Sampler:
@@ -69,6 +85,9 @@ class Sampler:
         self._position: tuple[float, ...] = _NAN3 + _NAN3
         self._motors: Sequence[float] = (float("nan"),) * self._motor_count
         self._true_rates: tuple[float, ...] | None = None
+        self._true_quat: tuple[float, ...] = _NAN4
+        self.truth_at: Callable[[int], Truth | None] | None = None
+        """Where the plant is ours and the autopilot is not: what it did at a vehicle time in ms."""
         # flat numbers, not a list of rows: nothing for the garbage collector to walk through while flying
         self._rows = array("d")
         self._batches: list[Columns] = []
@@ -96,6 +115,7 @@ class Sampler:
 
     def _on_truth(self, m: Message) -> None:
         self._true_rates = (m.rollspeed, m.pitchspeed, m.yawspeed)
+        self._true_quat = tuple(m.attitude_quaternion)
 
     def _on_motors(self, m: Message) -> None:
         self._motors = m.controls[: self._motor_count]
@@ -104,14 +124,26 @@ class Sampler:
         if self._attitude is None:
             return
         state = self._state
+        if self.truth_at is not None:
+            self._look_up(self.truth_at(round(self._attitude[0] * 1e3)))
         rates = self._true_rates or self._rates
         self._true_rates = None
         self._rows.extend(
-            (*self._attitude, *rates, *self._target, *self._position, *self._motors, state.nav_state, state.armed)
+            (
+                *(*self._attitude, *rates, *self._target, *self._position, *self._motors),
+                *(state.nav_state, state.armed, *self._true_quat),
+            )
         )
+        self._true_quat = _NAN4
         self._attitude = None
         if len(self._rows) >= self._rows_per_batch * self._values:
             self.flush()
+
+    def _look_up(self, truth: Truth | None) -> None:
+        """Take the plant's own word for the tick that the vehicle reports of."""
+        if truth is not None:
+            self._true_quat, self._true_rates = truth.quat, truth.rates
+            self._motors = (*truth.motors, *(0.0 for _ in range(self._motor_count)))[: self._motor_count]
 
     def flush(self) -> None:
         """Hand over the finished rows."""
@@ -126,10 +158,7 @@ class Sampler:
     def _columns(self, rows: npt.NDArray[np.float64]) -> Columns:
         names = ("t_s", "phi_rad", "theta_rad", "psi_rad", "p_rad_s", "q_rad_s", "r_rad_s")
         columns: Columns = {name: rows[:, i] for i, name in enumerate(names)}
-        w, x, y, z = rows[:, 7:11].T
-        columns["phi_sp_rad"] = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-        columns["theta_sp_rad"] = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
-        columns["psi_sp_rad"] = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        columns["phi_sp_rad"], columns["theta_sp_rad"], columns["psi_sp_rad"] = _euler(rows[:, 7:11])
         for i, name in enumerate(("p_sp_rad_s", "q_sp_rad_s", "r_sp_rad_s", "thrust_sp")):
             columns[name] = rows[:, 11 + i]
         for i, name in enumerate(("north_m", "east_m", "down_m", "v_north_m_s", "v_east_m_s", "v_down_m_s")):
@@ -142,6 +171,8 @@ class Sampler:
         columns["delta_lat"], columns["delta_lon"] = delta[:, 0], delta[:, 1]
         columns["nav_state"] = rows[:, 21 + count].astype(np.int16)
         columns["armed"] = rows[:, 22 + count].astype(np.bool_)
+        true = _euler(rows[:, 23 + count : 27 + count])
+        columns["phi_true_rad"], columns["theta_true_rad"], columns["psi_true_rad"] = true
         return columns
 
     def telemetry(self, segments: Sequence[Segment]) -> Telemetry:
@@ -160,3 +191,12 @@ class Sampler:
         for index, part in enumerate(segments):
             segment[(t_s >= part.start_s - 1e-9) & (t_s < part.end_s - 1e-9)] = index
         return Telemetry.from_columns({**columns, "segment": segment})
+
+
+def _euler(quat: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], ...]:
+    """(phi, theta, psi), rad, of (n, 4) quaternions, w first; NaN stays NaN."""
+    w, x, y, z = quat.T
+    phi = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    theta = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+    psi = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return phi, theta, psi

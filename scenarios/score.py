@@ -57,6 +57,7 @@ def flight_metrics(
     for name, shake in shakes.items():
         of_segments += _shake_metrics([shake], name)
     whole += margin_metrics(margins) if margins else []
+    whole += _estimate_metrics(telemetry, segments)
     whole += _data_metrics(telemetry, segments)
     order = {name: place for place, name in enumerate(METRICS)}
     return (*sorted(whole, key=lambda metric: order[metric.name]), *of_segments)
@@ -146,6 +147,21 @@ def _shake_metrics(shakes: Sequence[Oscillation], segment: str) -> list[Metric]:
         measured("oscillation_hz", worst.frequency_hz, quiet, segment),
         *(measured(name, max(shake.std_rad_s[k] for shake in known), "", segment) for k, name in enumerate(axes)),
     ]
+
+
+def _estimate_metrics(telemetry: Telemetry, segments: Sequence[Segment]) -> list[Metric]:
+    """How far the vehicle's own roll angle is from the truth."""
+    rows = [telemetry.between(segment.start_s, segment.end_s) for segment in segments]
+    errors = [float(np.nanmax(off)) for one in rows if np.isfinite(off := _roll_error(one)).any()]
+    reason = "" if errors else "the simulator's truth is not known"
+    worst = math.degrees(max(errors)) if errors else None
+    return [measured("roll_estimate_error_deg", worst, reason)]
+
+
+def _roll_error(rows: Telemetry) -> FloatArray:
+    """Magnitude, rad, the short way round; NaN where the truth is not known."""
+    off = rows["phi_rad"].astype(np.float64) - rows["phi_true_rad"].astype(np.float64)
+    return np.asarray(np.abs((off + math.pi) % (2.0 * math.pi) - math.pi))
 
 
 def _data_metrics(telemetry: Telemetry, segments: Sequence[Segment]) -> list[Metric]:

@@ -20,10 +20,10 @@ from sitl.profile import Profile
 from sitl.rotation import to_body
 
 _BLOCK = 1024
-_EARTH_FIELD_GAUSS = (0.215, 0.006, 0.427)
+EARTH_FIELD_GAUSS = (0.215, 0.006, 0.427)
 """Magnetic field at the origin (Zurich), NED, gauss."""
 _METRES_PER_DEG = 111_319.49
-_GPS_PERIOD_US = 100_000
+GPS_PERIOD_US = 100_000
 
 ORIGIN = (47.397742, 8.545594, 488.0)
 """PX4's customary home: latitude and longitude in deg, height above mean sea level in m."""
@@ -96,9 +96,18 @@ class Sensors:
 
     Args:
         plant: what moves. profile: noise levels. seed: of the noise.
+        field_gauss: magnetic field at the origin, NED, gauss. gps_period_us: between two fixes.
     """
 
-    def __init__(self, plant: Plant, profile: Profile, seed: int) -> None:
+    def __init__(
+        self,
+        plant: Plant,
+        profile: Profile,
+        seed: int,
+        *,
+        field_gauss: tuple[float, float, float] = EARTH_FIELD_GAUSS,
+        gps_period_us: int = GPS_PERIOD_US,
+    ) -> None:
         self._plant = plant
         self._profile = profile
         self._rng = np.random.default_rng([seed, 1])
@@ -111,6 +120,8 @@ class Sensors:
             + [profile.mag_noise_gauss] * 3
             + [profile.baro_noise_hpa]
         )
+        self._field_gauss = field_gauss
+        self._gps_period_us = gps_period_us
         self._next_gps_us = 0
         self.gyro = np.zeros(3)
         self._gps = Gps(0, *ORIGIN, (0.0, 0.0, 0.0))
@@ -127,7 +138,7 @@ class Sensors:
             self._row = 0
         measure_gyro(self._plant.rates, self._noise, self._row, self._profile.gyro_quantum_rad_s, self.gyro)
         if now_us >= self._next_gps_us:
-            self._next_gps_us += _GPS_PERIOD_US
+            self._next_gps_us += self._gps_period_us
             self._fix(now_us)
 
     def _fix(self, now_us: int) -> None:
@@ -148,7 +159,7 @@ class Sensors:
 
     def mag(self) -> tuple[float, float, float]:
         """Magnetic field, body axes, gauss."""
-        field = to_body(tuple(self._plant.quat.tolist()), _EARTH_FIELD_GAUSS)
+        field = to_body(tuple(self._plant.quat.tolist()), self._field_gauss)
         x, y, z = (np.array(field) + self._noise[self._row % _BLOCK, 6:9]).tolist()
         return x, y, z
 

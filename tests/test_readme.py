@@ -94,11 +94,11 @@ def test_every_command_shown_parses(words: list[str]) -> None:
 
 
 def test_every_command_and_option_is_in_the_contract() -> None:
-    rows = {row[0].split()[1]: set(re.findall(r"--[a-z][a-z-]+", row[0])) for row in table("command", "does")}
+    rows = {row[0].split()[1]: set(re.findall(r"--[a-z][a-z0-9-]+", row[0])) for row in table("command", "does")}
     for name in rows:
         with contextlib.redirect_stdout(io.StringIO()) as page, pytest.raises(SystemExit):
             cli.main([name, "--help"])
-        assert rows[name] == set(re.findall(r"--[a-z][a-z-]+", page.getvalue())) - {"--help"}, name
+        assert rows[name] == set(re.findall(r"--[a-z][a-z0-9-]+", page.getvalue())) - {"--help"}, name
     (names,) = (action.choices for action in cli._parser()._actions if action.dest == "command")
     assert set(rows) == set(names)
 

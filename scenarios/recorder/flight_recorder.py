@@ -55,7 +55,15 @@ def _pair(entity: str, name: str, unit: str, setpoint: str, measured: str, facto
 
 
 PLOTS = (
-    _pair("/roll", "roll", "deg", "phi_sp_rad", "phi_rad", DEG),
+    Plot(
+        "/roll",
+        {
+            "phi_sp_rad": ("roll set-point [deg]", SETPOINT),
+            "phi_rad": ("roll [deg]", MEASURED),
+            "phi_true_rad": ("roll, true [deg]", PALETTE[2]),
+        },
+        DEG,
+    ),
     _pair("/roll_rate", "p", "rad/s", "p_sp_rad_s", "p_rad_s"),
     _pair("/pitch", "pitch", "deg", "theta_sp_rad", "theta_rad", DEG),
     Plot("/pitch_rate", {"q_rad_s": ("q [rad/s]", PALETTE[1])}),

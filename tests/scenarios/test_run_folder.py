@@ -122,7 +122,7 @@ def test_what_load_run_reads_is_what_was_written(flown_run, tmp_path):
         (None, "cannot be read"),
         ("{", "is not JSON"),
         ("[]", "schema_version is None"),
-        ('{"schema_version": 99}', "schema_version is 99, this program reads 1"),
+        ('{"schema_version": 99}', "schema_version is 99, this program reads 2"),
     ],
 )
 def test_a_run_that_cannot_be_read_is_named(tmp_path, text, complaint):

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scenarios.flight import Segment
-from scenarios.sampler import ROWS_PER_BATCH, Columns, Sampler
+from scenarios.sampler import ROWS_PER_BATCH, Columns, Sampler, Truth
 from scenarios.telemetry import NO_SEGMENT
 from sitl.rotation import from_euler
 
@@ -44,8 +44,9 @@ class Wire:
     def motors(self, *signals: float) -> None:
         self._say("HIL_ACTUATOR_CONTROLS", controls=(*signals, *(0.0 for _ in range(16 - len(signals)))))
 
-    def truth(self, p: float) -> None:
-        self._say("HIL_STATE_QUATERNION", rollspeed=p, pitchspeed=0.0, yawspeed=0.0)
+    def truth(self, p: float, phi: float = 0.0) -> None:
+        quat = from_euler(phi, 0.0, 0.0)
+        self._say("HIL_STATE_QUATERNION", attitude_quaternion=quat, rollspeed=p, pitchspeed=0.0, yawspeed=0.0)
 
     def telemetry(self, segments: tuple[Segment, ...] = ()) -> Any:
         return self.sampler.telemetry(segments)
@@ -84,10 +85,25 @@ def test_what_was_never_reported_is_nan() -> None:
 def test_true_rates_are_taken_in_their_own_tick_only() -> None:
     wire = Wire()
     wire.attitude(4, p=0.5)
-    wire.truth(0.7)
+    wire.truth(0.7, phi=0.3)
     wire.attitude(8, p=0.6)
     rows = wire.telemetry()
     assert rows["p_rad_s"].tolist() == pytest.approx([0.7, 0.6])
+    assert rows["phi_true_rad"].tolist() == pytest.approx([0.3, math.nan], nan_ok=True)
+
+
+def test_a_plant_of_ours_is_asked_for_the_tick_that_the_vehicle_reports() -> None:
+    wire = Wire()
+    known = {8: Truth(from_euler(-0.2, 0.1, 1.0), (0.7, 0.0, 0.1), (0.1, 0.2, 0.3, 0.4))}
+    wire.sampler.truth_at = known.get
+    wire.attitude(4, roll=-0.1, p=0.5)
+    wire.attitude(8, roll=-0.19, p=0.6)
+    rows = wire.telemetry()
+    assert rows["phi_true_rad"].tolist() == pytest.approx([math.nan, -0.2], nan_ok=True)
+    assert rows["theta_true_rad"][1] == pytest.approx(0.1)
+    assert rows["psi_true_rad"][1] == pytest.approx(1.0)
+    assert rows["p_rad_s"].tolist() == pytest.approx([0.5, 0.7])
+    assert rows["motor3"].tolist() == pytest.approx([math.nan, 0.3], nan_ok=True)
 
 
 def test_an_attitude_out_of_order_is_left_out() -> None:

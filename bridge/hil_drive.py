@@ -1,0 +1,90 @@
+"""A client's time where a real autopilot flies our plant in lockstep: every wait is ticks of the plant.
+
+Client and plant live in one thread. So a set-point is sent between two known ticks, and what the client sees of the
+plant is of the tick that it is in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from bridge.clock import Clock, WallClock
+from bridge.drive import Drive
+from bridge.errors import PeerLost, PeerSilent
+from bridge.link import Link
+from bridge.lockstep import Lockstep
+
+ARRIVAL_S = 0.003
+"""Wall-clock time that a set-point is given to get through the autopilot's own threads before the next tick."""
+
+
+class HilDrive(Drive):
+    """Waits by stepping the plant.
+
+    Args:
+        lockstep: plant and autopilot.
+        patience_s: wall-clock time without an autopilot on the simulator's port after which it counts as lost, s.
+        clock: measures that time.
+
+    Attributes:
+        each_tick: called after every tick: the flight's recorder of the truth.
+        alive: called while nobody is there: raises if the autopilot's process has ended.
+    """
+
+    def __init__(self, lockstep: Lockstep, patience_s: float = 20.0, clock: Clock | None = None) -> None:
+        self.lockstep = lockstep
+        self.patience_s = patience_s
+        self.each_tick: Callable[[], object] | None = None
+        self.alive: Callable[[], object] = lambda: None
+        self._clock: Clock = clock or WallClock()
+        self._alone_since_us: int | None = None
+        self._was_there = False
+        self._quat: tuple[float, float, float, float] | None = None
+        self._hold = False
+
+    def now_us(self) -> int:
+        """Vehicle time: the plant's, which is the autopilot's, too; us."""
+        return self.lockstep.body.time_us
+
+    def sent_setpoint(self, quat: tuple[float, float, float, float]) -> None:
+        """A changed set-point must be there before time goes on, or it counts a tick or two later."""
+        self._hold = self._hold or quat != self._quat
+        self._quat = quat
+
+    def wait(self, link: Link, until_us: int) -> bytes | None:
+        """Let ticks pass, one at least, until something comes or `until_us` is reached.
+
+        Raises:
+            PeerLost: the autopilot left the simulator's port. PeerSilent: none ever came.
+        """
+        if self._hold:
+            self._hold = False
+            self._clock.sleep_until_us(self._clock.now_us() + round(ARRIVAL_S * 1e6))
+        while True:
+            self._tick()
+            data = link.recv()
+            if data is not None or self.now_us() >= until_us:
+                return data
+
+    def _tick(self) -> None:
+        lockstep = self.lockstep
+        before, restarts = self.now_us(), lockstep.report.restarts
+        lockstep.step()
+        if lockstep.report.restarts != restarts:
+            raise PeerLost("the autopilot", "it left the simulator's port")
+        if self.now_us() == before:
+            self._alone()
+            return
+        self._was_there, self._alone_since_us = True, None
+        if self.each_tick is not None:
+            self.each_tick()
+
+    def _alone(self) -> None:
+        now = self._clock.now_us()
+        if self._alone_since_us is None:
+            self._alone_since_us = now
+        self.alive()
+        if now - self._alone_since_us > self.patience_s * 1e6:
+            remedy = "Start it: PX4 connects to that port by itself (PX4_SIM_MODEL=none_iris)"
+            name = self.lockstep.link.name
+            raise PeerSilent(name, self.patience_s, "an autopilot on the simulator's port", remedy)

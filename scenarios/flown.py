@@ -1,0 +1,30 @@
+"""Where a run is, and what came back from its flights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from scenarios.flight import FlightRecord
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run is: flight `index` of `count`, in `phase`."""
+
+    index: int
+    count: int
+    name: str
+    phase: str
+
+
+@dataclass
+class Flown:
+    """What came back from the flights.
+
+    Attributes:
+        records: by job number. stopped: what ended the run early. owed: what is left to do by hand.
+    """
+
+    records: dict[int, FlightRecord] = field(default_factory=dict)
+    stopped: BaseException | None = None
+    owed: str = ""
