@@ -69,6 +69,7 @@ class HilSession:
         self.drive = HilDrive(self.lockstep)
         self.drive.each_tick = self._keep
         self._truth: dict[int, Truth] = {}
+        self._sampled = self._now()
         self._clock = WallClock()
         self._began_us = self._flown_us = 0
 
@@ -111,11 +112,16 @@ class HilSession:
         """
         return self._truth.get(time_ms)
 
+    def _now(self) -> tuple[int, tuple[float, float, float, float], tuple[float, float, float]]:
+        return self.body.time_us // 1000, self.body.truth.quat(), self.body.truth.rates()
+
     def _keep(self) -> None:
         if self.report.steps % _LOOK_TICKS == 0:
             self.drive.alive()
-        truth = self.body.truth
-        self._truth[self.body.time_us // 1000] = Truth(truth.quat(), truth.rates(), self.lockstep.motors)
+        # the motors are those that answered the sample of the tick before: they belong to its state
+        time_ms, quat, rates = self._sampled
+        self._truth[time_ms] = Truth(quat, rates, self.lockstep.motors)
+        self._sampled = self._now()
         if len(self._truth) > HISTORY_TICKS:
             del self._truth[next(iter(self._truth))]
 

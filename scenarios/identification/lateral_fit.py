@@ -19,8 +19,8 @@ MIN_COHERENCE = 0.6
 """Points below are not used: noise there, not response."""
 
 MIN_POINTS = 8
-FLOOR = 0.002
-"""Share of a response below which no point is trusted: sampling, interpolation and small angles cost about as much."""
+FLOORS = 0.003, 0.003
+"""Share of a response, roll rate and speed, to which a point is trusted at best: sampling and interpolation cost it."""
 
 NAMES = (*DERIVATIVE_NAMES, "motor_lag_s", "delay_s", "speed_delay_s")
 _Z = 1.959963984540054
@@ -99,8 +99,8 @@ def fit(
     guess = np.concatenate([first, [0.02, 0.005, 0.0]])
     scale = np.maximum(np.abs(guess), [0.1, 0.1, 1.0, 1.0, 0.5, 10.0, 0.01, 0.005, 0.01])
     data = [
-        (one.value[u], np.maximum(one.deviation[u], FLOOR * np.abs(one.value[u])), one.omega_rad_s[u])
-        for one, u in zip((roll, speed), used, strict=True)
+        (one.value[u], np.maximum(one.deviation[u], floor * np.abs(one.value[u])), one.omega_rad_s[u])
+        for one, u, floor in zip((roll, speed), used, FLOORS, strict=True)
     ]
 
     def residual(x: FloatArray) -> FloatArray:
