@@ -57,7 +57,10 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "phase_margin_deg": ("deg", "of the loop broken at delta_lat"),
     "delay_margin_s": ("s", "extra delay that makes the loop unstable"),
     "modulus_margin": ("1", "least distance of the loop from -1"),
-    "roll_estimate_error_deg": ("deg", "largest difference between estimated and true roll in a segment"),
+    "roll_estimate_error_deg": (
+        "deg",
+        "largest difference between estimated and true roll, up to 8 ms of lateness taken off",
+    ),
     "attitude_rate_hz": ("Hz", "ATTITUDE messages per second of vehicle time, as received"),
     "largest_gap_s": ("s", "longest time between two ATTITUDE messages"),
 }

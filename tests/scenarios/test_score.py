@@ -125,3 +125,36 @@ def test_divergence_counts_only_while_armed() -> None:
     phi = np.where(TIMES > T0 + 8, 3.0, 0.0)
     assert diverged(flown(phi_rad=phi)) == "diverged: roll beyond 80 deg at 48.00 s"
     assert diverged(flown(phi_rad=phi, armed=TIMES < T0 + 7)) == ""
+
+
+def estimated(late_ticks: int, offset_deg: float, known: bool = True) -> Telemetry:
+    """A roll step whose estimate is late and off, 250 rows a second."""
+    t = np.arange(0.0, 4.0, 0.004)
+    true = np.radians(10.0) * (1.0 - np.exp(-8.0 * t))
+    phi = np.concatenate([np.full(late_ticks, true[0]), true[: len(true) - late_ticks]]) + math.radians(offset_deg)
+    return Telemetry.from_columns({"t_s": t, "phi_rad": phi, **({"phi_true_rad": true} if known else {})})
+
+
+@pytest.mark.parametrize("late_ticks", [0, 1, 2])
+def test_an_estimate_may_be_late_but_not_wrong(late_ticks: int) -> None:
+    segment = Segment("step", "hold", "step", 0.0, 3.9, math.radians(10.0), 0.0)
+    for offset_deg in (0.0, 0.3, -0.7):
+        metrics = flight_metrics(estimated(late_ticks, offset_deg), [segment])
+        (found,) = (one for one in metrics if one.name == "roll_estimate_error_deg")
+        assert found.value == pytest.approx(abs(offset_deg), abs=0.02)
+
+
+def test_a_later_estimate_is_wrong() -> None:
+    segment = Segment("step", "hold", "step", 0.0, 3.9, math.radians(10.0), 0.0)
+    metrics = flight_metrics(estimated(12, 0.0), [segment])
+    (found,) = (one for one in metrics if one.name == "roll_estimate_error_deg")
+    assert found.value is not None
+    # ten of the twelve ticks are left, 40 ms of 80 deg/s at first
+    assert found.value > 2.0
+
+
+def test_without_the_truth_nothing_is_said_of_the_estimate() -> None:
+    segment = Segment("step", "hold", "step", 0.0, 3.9, math.radians(10.0), 0.0)
+    metrics = flight_metrics(estimated(0, 0.0, known=False), [segment])
+    (found,) = (one for one in metrics if one.name == "roll_estimate_error_deg")
+    assert (found.value, found.reason) == (None, "the simulator's truth is not known")
