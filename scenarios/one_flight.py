@@ -51,6 +51,8 @@ _INTERVALS_US = {
 }
 _UNUSED_STREAMS = (4, 24, 26, 29, 31, 33, 36, 74, 85, 105, 111, 141, 147, 230, 241, 331)
 _READY_TIMEOUT_S = 60.0
+SETTLE_S = 2.5
+"""Vehicle time that a real autopilot is given to take up new outputs: it looks once a second, and never while armed."""
 _BACKUP = ".backup.params"
 
 
@@ -280,6 +282,8 @@ class _Flight:
             self._files.parameters(".params", {name: value for name, (value, _) in self._job.parameters.items()})
         self._uploaded = True
         client.upload(self._job.parameters)
+        if self._session is not None:
+            client.wait(SETTLE_S)
 
     def _restore(self, client: Client) -> None:
         if not self._uploaded or self._restored:
