@@ -54,10 +54,9 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
         raise UsageError(f"--samples {args.samples}: give 1 or more")
     model, profile = resolve_vehicle(args.vehicle, scaling), get_profile(args.profile or "sitl")
     table = ParameterTable(airframe_parameters(model, profile))
-    sets = []
+    sets, warnings = [], []
     for one in load_all(args.gains):
-        for warning in check(one, table):
-            tell(f"{one.name}: {warning}")
+        warnings += [f"{one.name}: {warning}" for warning in check(one, table)]
         sets.append((one, roll_set(model, profile, one.parameters)))
     with spinner() as show:
         show(f"{len(sets)} gain sets x {args.samples} samples")
@@ -71,6 +70,8 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
             distribution=args.distribution,
             spread_sigma=args.spread,
         )
+    for warning in warnings:
+        tell(warning)
     text = json.dumps(analysis_object(analysis), indent=2) if args.json else analysis_text(analysis)
     sys.stdout.write(text + "\n")
     return EXIT_OK

@@ -43,8 +43,9 @@ class Spread:
 
     Attributes:
         nominal: on the nominal model; None if it could not be measured.
-        worst, median, best: over the samples on which it could; None if on none.
-        unset: samples on which it could not be measured.
+        worst, median, best: over the random samples on which it could; None if on none. Without random samples, of
+            the nominal model.
+        unset: random samples on which it could not be measured.
     """
 
     nominal: float | None
@@ -80,14 +81,16 @@ class SetAnalysis:
     """One gain set.
 
     Attributes:
-        gain_set: what was tried. spreads: by metric and margin.
-        passes: samples that meet every limit. of: samples. interval: Wilson's, 95 %, of the fraction.
+        gain_set: what was tried. spreads: by metric and margin. nominal_passes: the nominal model meets every limit.
+        passes: random samples that do. of: random samples (without any, the nominal model is the only one).
+        interval: Wilson's, 95 %, of the fraction.
         unstable: samples whose linear loop is unstable. cycling: samples that shake in a limit cycle.
         diverged: samples that were lost. sensitivities: of `EXPLAINED`.
     """
 
     gain_set: GainSet
     spreads: Mapping[str, Spread]
+    nominal_passes: bool
     passes: int
     of: int
     interval: tuple[float, float]
@@ -183,17 +186,19 @@ def _of_set(
         row = values[limit.metric][g]
         good &= np.array([not math.isnan(value) and limit.holds(value) for value in row.tolist()])
     good &= ~found.diverged[g]
-    passes, of = int(good.sum()), len(good)
+    drawn = _drawn(len(good))
+    passes, of = int(good[drawn].sum()), len(good[drawn])
     shakes = np.nan_to_num(found.metrics["oscillation_rad_s"][g], nan=0.0)
     return SetAnalysis(
         gain_set=gain_set,
         spreads={name: spread(name, row[g]) for name, row in values.items() if name in METRICS},
+        nominal_passes=bool(good[0]),
         passes=passes,
         of=of,
         interval=wilson(passes, of),
-        unstable=int((~found.margins.closed_loop_stable[g]).sum()),
-        cycling=int((shakes > (STANDING.maximum or 0.0)).sum()),
-        diverged=int(found.diverged[g].sum()),
+        unstable=int((~found.margins.closed_loop_stable[g][drawn]).sum()),
+        cycling=int((shakes[drawn] > (STANDING.maximum or 0.0)).sum()),
+        diverged=int(found.diverged[g][drawn].sum()),
         sensitivities=tuple(sensitivity(name, values[name][g], found.derivatives, model) for name in EXPLAINED),
     )
 
@@ -204,15 +209,21 @@ def spread(name: str, row: FloatArray) -> Spread:
     Args:
         name: of the metric. row: (S,) over the samples, the nominal first; NaN is UNSET.
     """
-    known = np.sort(row[~np.isnan(row)])
+    nominal = None if math.isnan(row[0]) else float(row[0])
+    drawn = row[_drawn(len(row))]
+    known = np.sort(drawn[~np.isnan(drawn)])
     if not len(known):
-        return Spread(None, None, None, None, len(row))
+        return Spread(nominal, None, None, None, len(drawn))
     if name == "droop_deg":
         known = known[np.argsort(np.abs(known), kind="stable")]
     low_is_worst = name in HIGH_IS_GOOD
     worst, best = (known[0], known[-1]) if low_is_worst else (known[-1], known[0])
-    nominal = None if math.isnan(row[0]) else float(row[0])
-    return Spread(nominal, float(worst), float(np.median(known)), float(best), len(row) - len(known))
+    return Spread(nominal, float(worst), float(np.median(known)), float(best), len(drawn) - len(known))
+
+
+def _drawn(samples: int) -> slice:
+    """The random samples: all behind the nominal one, or that one if it is alone."""
+    return slice(1, None) if samples > 1 else slice(None)
 
 
 def wilson(passes: int, of: int) -> tuple[float, float]:

@@ -59,7 +59,8 @@ def _set(one: SetAnalysis) -> list[str]:
     ]
     lines = [
         f"{one.gain_set.name}: passes {one.passes} of {one.of} ({100 * one.passes / one.of:.1f} %, 95 % interval "
-        f"{100 * low:.1f} to {100 * high:.1f} %)" + ("; " + ", ".join(troubles) if troubles else ""),
+        f"{100 * low:.1f} to {100 * high:.1f} %), the nominal model {'passes' if one.nominal_passes else 'fails'}"
+        + ("; " + ", ".join(troubles) if troubles else ""),
         f"  {'':<22}{'unit':<6}{'nominal':>9}{'worst':>9}{'median':>9}{'best':>9}{'unset':>7}   matters most",
     ]
     explained = {s.metric: s for s in one.sensitivities}
@@ -104,6 +105,7 @@ def analysis_object(analysis: Analysis) -> dict[str, Any]:
             {
                 "name": one.gain_set.name,
                 "parameters": dict(one.gain_set.parameters),
+                "nominal_passes": one.nominal_passes,
                 "passes": one.passes,
                 "of": one.of,
                 "pass_fraction": one.passes / one.of,

@@ -209,6 +209,9 @@ def step_matrices(derivatives: FloatArray, motor_lag_s: float, dt_s: float) -> F
 
     Returns:
         (S, 4, 6): rows v, p, phi, motor torque; columns the same four, the command, the excess of gravity (held).
+
+    Raises:
+        UsageError: a model so unstable that a tick is beyond all numbers.
     """
     count = len(derivatives)
     a = np.zeros((count, 6, 6))
@@ -220,7 +223,15 @@ def step_matrices(derivatives: FloatArray, motor_lag_s: float, dt_s: float) -> F
     a[:, 0, torque], a[:, 1, torque] = Yd, Ld
     if motor_lag_s > 0.0:
         a[:, 3, 3], a[:, 3, 4] = -1.0 / motor_lag_s, 1.0 / motor_lag_s
-    made = _exponential(a * dt_s)[:, :4, :]
+    with np.errstate(over="ignore", invalid="ignore"):
+        made = _exponential(a * dt_s)[:, :4, :]
+    wild = ~np.isfinite(made).all(axis=(1, 2))
+    if wild.any():
+        values = ", ".join(f"{value:.3g}" for value in derivatives[int(np.argmax(wild))])
+        raise UsageError(
+            f"the derivatives {values} make a model that grows beyond all numbers within a tick of {1e3 * dt_s:g} ms: "
+            "no aircraft. Check the lengths of the airframes, or the file's derivatives"
+        )
     if motor_lag_s <= 0.0:
         made[:, 3, :] = 0.0
     return made
