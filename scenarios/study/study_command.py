@@ -33,10 +33,16 @@ def run(args: argparse.Namespace, *, seed: int) -> int:
     from scenarios.progress import spinner
     from scenarios.study.recompute import recompute
     from scenarios.study.text import study_object, study_text
-    from sitl.errors import UsageError
+    from sitl.errors import FileError, UsageError
 
     if not 1 <= args.samples <= 20_000:
         raise UsageError(f"--samples {args.samples}: give 1 to 20000")
+    if not args.no_figures:
+        try:
+            # better now than after minutes of work
+            (args.out / "figures").mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise FileError(args.out, f"cannot be made: {error.strerror}", "Choose another --out") from error
     with spinner() as show:
         study = recompute(samples=args.samples, seed=seed, tune=args.tune, progress=show)
         page = None
