@@ -69,6 +69,7 @@ class FlightJob:
         connect: link URL of a vehicle, or memory:// for one of our own.
         live_port: port for viewers, None for none.
         patience_s: wall-clock silence after which a vehicle elsewhere counts as lost, s.
+        suffix: behind the gain set's file name, for a flight that is kept beside another of the same set.
     """
 
     gain_set: GainSet
@@ -81,6 +82,12 @@ class FlightJob:
     connect: str = MEMORY
     live_port: int | None = None
     patience_s: float = 5.0
+    suffix: str = ""
+
+    @property
+    def slug(self) -> str:
+        """What the flight's files are called."""
+        return self.gain_set.slug + self.suffix
 
     def flown_table(self) -> ParameterTable:
         """The airframe's parameters with this job's on top: what the vehicle holds in flight."""
@@ -188,7 +195,7 @@ class _Flight:
             self._files = self._stack.enter_context(
                 FlightFiles(
                     job.folder,
-                    job.gain_set.slug,
+                    job.slug,
                     name=job.gain_set.name,
                     rotors=job.model.airframe.rotors,
                     live_port=job.live_port,
