@@ -15,7 +15,7 @@ from bridge.drive import Drive
 from bridge.errors import CommandRefused, NotReady, PeerSilent, UploadFailed
 from bridge.link import Link
 from bridge.param_client import ParamClient
-from bridge.param_operation import Outcome, ParamOperation, ParamValue
+from bridge.param_operation import Outcome, ParamOperation, ParamResult, ParamValue
 from bridge.px4_modes import PX4_MODES
 from bridge.vehicle_state import VehicleState
 from sitl.modes import Mode
@@ -226,12 +226,14 @@ class Client:
 
     # -- commands ----------------------------------------------------------------------------------------------
 
-    def command(self, name: str, command: int, *params: float, timeout_s: float = 0.0) -> None:
+    def command(
+        self, name: str, command: int, *params: float, timeout_s: float = 0.0, tries: int = ACK_TRIES
+    ) -> None:
         """Send a COMMAND_LONG and wait for its COMMAND_ACK; sent again when no answer comes.
 
         Args:
             name: for the error. command: MAV_CMD number. params: up to seven.
-            timeout_s: longest wait after an IN_PROGRESS, s.
+            timeout_s: longest wait after an IN_PROGRESS, s. tries: how often it is sent at most.
 
         Raises:
             CommandRefused: with the vehicle's own words.
@@ -239,7 +241,7 @@ class Client:
         """
         padded = (*params, *(0.0 for _ in range(7 - len(params))))
         texts_before = len(self.state.texts)
-        for attempt in range(ACK_TRIES):
+        for attempt in range(tries):
             self._acks.clear()
             self.send(
                 "COMMAND_LONG",
@@ -252,7 +254,7 @@ class Client:
             if self.wait_until(lambda: any(acked == command for acked, _ in self._acks), ACK_TIMEOUT_US * 1e-6):
                 break
         else:
-            raise PeerSilent(self.link.name, ACK_TRIES * ACK_TIMEOUT_US * 1e-6, f"an answer to {name}")
+            raise PeerSilent(self.link.name, tries * ACK_TIMEOUT_US * 1e-6, f"an answer to {name}")
         result = next(result for acked, result in self._acks if acked == command)
         if result == _IN_PROGRESS and timeout_s > 0.0:
             self.wait_until(lambda: (command, _ACCEPTED) in self._acks, timeout_s)
@@ -274,9 +276,9 @@ class Client:
             return False
         return True
 
-    def request(self, message_id: int) -> None:
+    def request(self, message_id: int, *, tries: int = ACK_TRIES) -> None:
         """Ask for one message once."""
-        self.command(f"request of message {message_id}", CMD_REQUEST_MESSAGE, message_id)
+        self.command(f"request of message {message_id}", CMD_REQUEST_MESSAGE, message_id, tries=tries)
 
     def set_mode(self, mode: Mode) -> None:
         """Ask for a flight mode; `state.nav_state` shows it with the vehicle's next CURRENT_MODE or HEARTBEAT.
@@ -341,6 +343,23 @@ class Client:
                 raise UploadFailed(operation.name, math.nan, None, result.reason if result else "no answer in time")
             values[operation.name] = result.seen
         return values
+
+    def try_read(self, names: Iterable[str], timeout_s: float = 5.0) -> dict[str, ParamResult]:
+        """Read parameters that may not exist.
+
+        Args:
+            names: of them. timeout_s: vehicle time for all, s.
+
+        Returns:
+            name -> what came of it: `seen` holds the value where the outcome is VERIFIED.
+        """
+        operations = [self.params.start_read(name) for name in names]
+        self._finish(operations, timeout_s)
+        silent = "no answer in time"
+        return {
+            one.name: one.result or ParamResult(one.name, Outcome.TIMEOUT, None, None, silent, one.tries)
+            for one in operations
+        }
 
     def upload(self, values: Mapping[str, tuple[float | int | bytes, ParameterType]], timeout_s: float = 60.0) -> None:
         """Set parameters and read each back; float32-exact, or it has failed.

@@ -13,6 +13,8 @@ FroudeError
       +-- AlreadyArmed     somebody is flying it
       +-- CommandRefused   the vehicle said no
       +-- UploadFailed     a parameter did not end up as asked
+      +-- BoardStopped     a board's real-time simulation could not be kept up
+      +-- HilUnfit         an autopilot that cannot fly our plant as it is set up
 
 Each keeps what it names as attributes, so a runner can record a refusal as a result instead of parsing text.
 """
@@ -186,3 +188,34 @@ class UploadFailed(LinkError):
         self.reason = reason
         read_back = "nothing came back" if seen is None else f"the vehicle holds {seen!r}"
         super().__init__(f"{parameter} = {wanted!r} was not taken: {reason} ({read_back})")
+
+
+class BoardStopped(LinkError):
+    """The simulation of a board's sensors came to a stop, so the flight is over.
+
+    Args:
+        link: the board's.
+        why: what was seen.
+    """
+
+    def __init__(self, link: str, why: str) -> None:
+        self.link = link
+        self.why = why
+        super().__init__(
+            f"{link}: {why}; the flight is stopped, its result is worthless. Close other programs, or use a quicker "
+            "computer"
+        )
+
+
+class HilUnfit(LinkError):
+    """An autopilot that cannot fly our plant as it is set up.
+
+    Args:
+        peer: its link.
+        findings: what is wrong and what to do, a sentence each.
+    """
+
+    def __init__(self, peer: str, findings: Sequence[str]) -> None:
+        self.peer = peer
+        self.findings = tuple(findings)
+        super().__init__(f"{peer}: " + " ".join(findings))

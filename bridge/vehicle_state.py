@@ -8,6 +8,9 @@ from dataclasses import dataclass, field
 from bridge.messages import Message
 from bridge.px4_modes import ARMED, PX4_MODES
 
+HIL = 32
+"""MAV_MODE_FLAG_HIL_ENABLED."""
+
 _PREARM_CHECK = 0x10000000
 _TEXT_CHUNK = 50
 
@@ -20,6 +23,7 @@ class VehicleState:
 
     Attributes:
         nav_state: PX4's mode number, -1 before the first heartbeat. armed: motors may turn.
+        autopilot: MAV_AUTOPILOT, -1 before the first heartbeat; 12 is PX4. hil_enabled: a board that flies a simulation.
         system_status: MAV_STATE. prearm_ok: it would arm in this mode. landed_state: MAV_LANDED_STATE.
         home_alt_m: height of home above mean sea level, m; None until HOME_POSITION.
         position_ned, velocity_ned: m, m/s; None until LOCAL_POSITION_NED.
@@ -29,6 +33,8 @@ class VehicleState:
 
     nav_state: int = -1
     armed: bool = False
+    autopilot: int = -1
+    hil_enabled: bool = False
     system_status: int = 0
     prearm_ok: bool = False
     landed_state: int = 0
@@ -55,6 +61,8 @@ class VehicleState:
         """Take a HEARTBEAT of the autopilot."""
         self.nav_state = _NAV_STATES.get(m.custom_mode, -1)
         self.armed = bool(m.base_mode & ARMED)
+        self.autopilot = m.autopilot
+        self.hil_enabled = bool(m.base_mode & HIL)
         self.system_status = m.system_status
 
     def on_text(self, m: Message, now_us: int) -> str | None:

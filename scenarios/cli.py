@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import NoReturn
 
-from scenarios import analyse_command, fly_command, sitl_command
+from scenarios import analyse_command, fly_command, hil_command, sitl_command
 from scenarios.identification import identify_command
 from scenarios.study import study_command
 from scenarios.tuning import tune_command
@@ -59,6 +59,15 @@ def _parser() -> argparse.ArgumentParser:
 
     sub = add("sitl", _sitl, "Serve simulated vehicles to any ground station.", "froude sitl ant-x ant-r --speed 2")
     sitl_command.add_arguments(sub)
+    _vehicle_options(sub)
+
+    sub = add(
+        "hil",
+        _hil,
+        "The plant for a real autopilot: a PX4 SITL in lockstep, or a board on a serial port.",
+        "froude hil ant-x --check",
+    )
+    hil_command.add_arguments(sub)
     _vehicle_options(sub)
 
     sub = add(
@@ -197,6 +206,12 @@ def _sitl(args: argparse.Namespace) -> int:
     from sitl.vehicle_spec import DEFAULT_SCALING
 
     return sitl_command.run(args, scaling=_words(args.scaling, DEFAULT_SCALING), seed=_seed(args), tell=_tell)
+
+
+def _hil(args: argparse.Namespace) -> int:
+    from sitl.vehicle_spec import DEFAULT_SCALING
+
+    return hil_command.run(args, scaling=_words(args.scaling, DEFAULT_SCALING), seed=_seed(args), tell=_tell)
 
 
 def _analyse(args: argparse.Namespace) -> int:

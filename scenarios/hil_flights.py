@@ -7,10 +7,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from scenarios.board_session import BoardSession
 from scenarios.flight import FlightRecord
 from scenarios.flown import Flown, Progress
 from scenarios.hil_session import HilSession
 from scenarios.one_flight import FlightJob, FlightStoppedError, fly
+from scenarios.plant_session import PlantSession
 from scenarios.px4_process import Px4Process, free_instance
 from sitl.errors import FroudeError
 
@@ -29,7 +31,8 @@ def fly_with_autopilot(
 
     Args:
         jobs: in order; their `connect` is the autopilot's MAVLink, unless `px4` is given.
-        hil: link of the simulator's protocol. px4: build directory; its own instance flies every job, fresh.
+        hil: link of the simulator's protocol, or a board's serial port. px4: build directory; its own instance flies
+            every job, fresh.
         say: called with a line for people. progress: called at every phase of every flight.
 
     Returns:
@@ -37,15 +40,17 @@ def fly_with_autopilot(
     """
     flown = Flown()
     with ExitStack() as stack:
-        shared: HilSession | None = None
+        shared: HilSession | BoardSession | None = None
         for index, job in enumerate(jobs):
             try:
                 if px4 is None:
-                    shared = shared or stack.enter_context(_session(hil, job, say))
-                    flown.records[index] = _fly(index, jobs, shared, progress)
+                    if shared is None:
+                        shared = _session(hil, job, say)
+                        stack.enter_context(shared)
+                    flown.records[index] = _fly(index, jobs, shared, progress, say)
                 else:
                     with _own_autopilot(px4, job, say) as session:
-                        flown.records[index] = _fly(index, jobs, session, progress)
+                        flown.records[index] = _fly(index, jobs, session, progress, say)
             except FlightStoppedError as stop:
                 flown.records[index] = stop.record
                 flown.stopped, flown.owed = stop.cause, "" if px4 is not None else stop.owed
@@ -57,14 +62,20 @@ def fly_with_autopilot(
 
 
 def _fly(
-    index: int, jobs: Sequence[FlightJob], session: HilSession, progress: Callable[[Progress], object]
+    index: int,
+    jobs: Sequence[FlightJob],
+    session: PlantSession,
+    progress: Callable[[Progress], object],
+    say: Say,
 ) -> FlightRecord:
     job = jobs[index]
     session.begin()
-    return fly(job, lambda phase: progress(Progress(index, len(jobs), job.gain_set.name, phase)), session)
+    return fly(job, lambda phase: progress(Progress(index, len(jobs), job.gain_set.name, phase)), session, say)
 
 
-def _session(hil: str, job: FlightJob, say: Say) -> HilSession:
+def _session(hil: str, job: FlightJob, say: Say) -> HilSession | BoardSession:
+    if hil.startswith("serial"):
+        return BoardSession(hil, job.model, job.profile, seed=job.scenario.seed, may_arm=True, say=say)
     return HilSession(hil, job.connect, job.model, job.profile, seed=job.scenario.seed, say=say)
 
 

@@ -46,6 +46,8 @@ class HilSession:
         LinkError: a port is taken.
     """
 
+    board = False
+
     def __init__(
         self,
         simulator_url: str,
@@ -85,6 +87,21 @@ class HilSession:
     def report(self) -> LockstepReport:
         """How plant and autopilot kept step."""
         return self.lockstep.report
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What makes this flight worthless."""
+        return tuple(self.report.faults or ())
+
+    @property
+    def answers(self) -> int:
+        """Motor commands that came since `begin`."""
+        return self.report.answered
+
+    @property
+    def motors(self) -> tuple[float, ...]:
+        """The latest motor commands."""
+        return self.lockstep.motors
 
     def begin(self) -> None:
         """Another flight begins: its report is its own."""

@@ -6,11 +6,10 @@ Whatever goes wrong, what was flown so far is on disk and in the record before a
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 from bridge.client import Client
@@ -19,30 +18,25 @@ from bridge.connection import Connection
 from bridge.drive import Drive, NetworkDrive, SharedDrive
 from bridge.errors import AlreadyArmed, PeerLost, PeerSilent
 from bridge.link import Link, MemoryLink, open_link
-from bridge.param_operation import ParamValue
 from bridge.vehicle_server import ServerLink, VehicleServer
-from scenarios import interrupts, sampler
+from scenarios import hil_flight, interrupts, sampler
 from scenarios.flight import Event, FlightRecord
 from scenarios.flight_files import FlightFiles
-from scenarios.gain_set import GainSet
-from scenarios.hil_session import HilSession
+from scenarios.flight_job import MEMORY, FlightJob
 from scenarios.limits import Outcome, judge
+from scenarios.param_loan import ParamLoan, open_loan
 from scenarios.pilot import FlightLog, Pilot
+from scenarios.plant_session import PlantSession
 from scenarios.sampler import Sampler
-from scenarios.scenario import Scenario
 from scenarios.score import diverged, flight_metrics
 from scenarios.telemetry import Telemetry
 from sitl.control_settings import mix_of
 from sitl.errors import FroudeError, LinkError
-from sitl.param_corrections import companions
-from sitl.parameters import ParameterTable, ParameterType
-from sitl.profile import Profile
 from sitl.sampled_loop import RollGains
 from sitl.stability import loop_margins
-from sitl.vehicle import Vehicle, airframe_parameters
-from sitl.vehicle_spec import VehicleModel
+from sitl.vehicle import Vehicle
 
-MEMORY = "memory://"
+__all__ = ["MEMORY", "FlightJob", "FlightStoppedError", "flown_margins", "fly"]
 
 _INTERVALS_US = {
     **dict.fromkeys(sampler.SAMPLED, sampler.CRUISE_INTERVAL_US),
@@ -54,59 +48,6 @@ _READY_TIMEOUT_S = 60.0
 SETTLE_S = 2.5
 """Vehicle time that a real autopilot is given to take up new outputs: it looks once a second, and never while armed."""
 _BACKUP = ".backup.params"
-
-
-@dataclass(frozen=True)
-class FlightJob:
-    """Everything one flight needs; plain data, so that it can go to another process.
-
-    Attributes:
-        gain_set: what is tried.
-        parameters: name -> (value, type): everything that is uploaded, the other axes' gains too.
-        scenario, model, profile: what flies how.
-        warnings: of the gain set's check.
-        folder: where the flight's files go; None keeps nothing.
-        connect: link URL of a vehicle, or memory:// for one of our own.
-        live_port: port for viewers, None for none.
-        patience_s: wall-clock silence after which a vehicle elsewhere counts as lost, s.
-        suffix: behind the gain set's file name, for a flight that is kept beside another of the same set.
-    """
-
-    gain_set: GainSet
-    parameters: Mapping[str, tuple[float | int, ParameterType]]
-    scenario: Scenario
-    model: VehicleModel
-    profile: Profile
-    warnings: tuple[str, ...] = ()
-    folder: Path | None = None
-    connect: str = MEMORY
-    live_port: int | None = None
-    patience_s: float = 5.0
-    suffix: str = ""
-
-    @property
-    def slug(self) -> str:
-        """What the flight's files are called."""
-        return self.gain_set.slug + self.suffix
-
-    def flown_table(self) -> ParameterTable:
-        """The airframe's parameters with this job's on top: what the vehicle holds in flight."""
-        table = ParameterTable(airframe_parameters(self.model, self.profile))
-        for name, (value, _) in self.parameters.items():
-            table.set(name, value)
-        return table
-
-    @property
-    def rows_per_batch(self) -> int:
-        """Telemetry rows that are written together: few for eyes that watch or a link that may die, else many."""
-        if self.live_port is not None:
-            return 50
-        return sampler.ROWS_PER_BATCH if self.in_memory else 250
-
-    @property
-    def in_memory(self) -> bool:
-        """The vehicle is ours, in this thread."""
-        return self.connect.startswith(MEMORY)
 
 
 class FlightStoppedError(Exception):
@@ -127,13 +68,17 @@ class FlightStoppedError(Exception):
 
 
 def fly(
-    job: FlightJob, progress: Callable[[str], object] = lambda _: None, session: HilSession | None = None
+    job: FlightJob,
+    progress: Callable[[str], object] = lambda _: None,
+    session: PlantSession | None = None,
+    say: Callable[[str], object] = lambda _: None,
 ) -> FlightRecord:
     """Fly one job.
 
     Args:
         job: what to fly. progress: called with a short text at every phase.
         session: a real autopilot on our plant, already open; without one the job's own link is opened.
+        say: called with a line for people.
 
     Returns:
         the record, scored.
@@ -142,7 +87,7 @@ def fly(
         FlightStoppedError: the link died, a parameter was refused, a file could not be written, or Ctrl-C; carries
             the record so far.
     """
-    flight = _Flight(job, progress, session)
+    flight = _Flight(job, progress, session, say)
     try:
         flight.run()
     except (FroudeError, KeyboardInterrupt) as cause:
@@ -174,16 +119,22 @@ def _spare_the_collector() -> None:
 class _Flight:
     """The moving parts of one flight."""
 
-    def __init__(self, job: FlightJob, progress: Callable[[str], object], session: HilSession | None) -> None:
+    def __init__(
+        self,
+        job: FlightJob,
+        progress: Callable[[str], object],
+        session: PlantSession | None,
+        say: Callable[[str], object],
+    ) -> None:
         self._job = job
         self._session = session
         self._progress = progress
+        self._tell = say
         self._stack = ExitStack()
         self._events: list[Event] = []
         self._log = FlightLog()
-        self._backup: dict[str, ParamValue] = {}
-        self._uploaded = False
-        self._restored = False
+        self._notes: list[str] = []
+        self._loan: ParamLoan | None = None
         self._sampler: Sampler | None = None
         self._files: FlightFiles | None = None
 
@@ -206,11 +157,18 @@ class _Flight:
         _spare_the_collector()
         client.on_text = self._on_text
         client.connect()
+        self._borrow(client)
         self._set_streams(client)
-        client.make_ready(_READY_TIMEOUT_S)
+        session = self._session
+        if session is None:
+            client.make_ready(_READY_TIMEOUT_S)
+        else:
+            hil_flight.make_ready(client, session, job.model, _READY_TIMEOUT_S)
         if client.state.armed:
             raise AlreadyArmed(client.link.name)
         pilot = Pilot(client, job.scenario, self._say(client), self._progress, self._sampled)
+        if session is not None:
+            pilot.watch = hil_flight.motor_watch(client, session, job.model)
         self._log = pilot.log
         try:
             self._upload(client)
@@ -224,7 +182,7 @@ class _Flight:
         trouble: LinkError | None = None
         steps: list[Callable[[], object]] = [
             lambda: pilot.come_down(may_force=self._job.in_memory or self._session is not None),
-            lambda: self._restore(client),
+            self._restore,
             lambda: self._default_streams(client),
         ]
         for step in steps:
@@ -280,24 +238,39 @@ class _Flight:
         own = self._session is not None
         return tuple(one for one in sampler.SAMPLED if not (own and one in sampler.SIMULATORS))
 
+    def _borrow(self, client: Client) -> None:
+        """Open the loan of the vehicle's parameters; what earlier flights still owe is given back first."""
+        job = self._job
+
+        def note(text: str) -> None:
+            self._tell(text)
+            self._notes.append(text)
+            self._say(client)(5, text)
+
+        if job.in_memory:
+            self._loan = ParamLoan(client, None)
+        else:
+            self._loan = open_loan(
+                client, job.connect, gain_set=job.gain_set.name, folder=job.folder, command=job.command, tell=note
+            )
+        self._stack.callback(self._loan.close)
+
     def _upload(self, client: Client) -> None:
+        assert self._loan is not None
         self._progress("upload")
-        touched = (*self._job.parameters, *companions(self._job.parameters))
-        self._backup = client.read_parameters(touched)
+        parameters = self._job.parameters
+        self._loan.back_up(parameters)
         if self._files is not None:
-            self._files.parameters(_BACKUP, {name: value.value for name, value in self._backup.items()})
-            self._files.parameters(".params", {name: value for name, (value, _) in self._job.parameters.items()})
-        self._uploaded = True
-        client.upload(self._job.parameters)
+            self._files.parameters(_BACKUP, {name: value.value for name, value in self._loan.was.items()})
+            self._files.parameters(".params", {name: value for name, (value, _) in parameters.items()})
+        self._loan.set(parameters)
         if self._session is not None:
             client.wait(SETTLE_S)
 
-    def _restore(self, client: Client) -> None:
-        if not self._uploaded or self._restored:
-            return
-        self._progress("restore")
-        client.upload({name: (value.raw, value.type) for name, value in self._backup.items()})
-        self._restored = True
+    def _restore(self) -> None:
+        if self._loan is not None and self._loan.is_owed:
+            self._progress("restore")
+            self._loan.give_back()
 
     def _default_streams(self, client: Client) -> None:
         if not self._job.in_memory:
@@ -322,11 +295,8 @@ class _Flight:
     @property
     def owed(self) -> str:
         """What is left to do on a vehicle that is not ours, in a sentence; empty if nothing."""
-        if not self._uploaded or self._restored or self._job.in_memory:
-            return ""
-        old = ", ".join(f"{name} = {value}" for name, value in self._backup.items())
-        remedy = f"load {self._files.path(_BACKUP)}" if self._files is not None else f"set {old}"
-        return f"The vehicle's own parameters were NOT restored: {remedy}"
+        backup = self._files.path(_BACKUP) if self._files is not None else None
+        return self._loan.owed(backup) if self._loan is not None else ""
 
     def close(self) -> None:
         """Let go of link and files as they are."""
@@ -354,11 +324,11 @@ class _Flight:
         outcome, reason, metrics = judge(metrics, job.scenario.limits, failure)
         if stopped is not None and not log.failure:
             outcome = Outcome.UNSET
-        notes = list(log.notes)
+        notes = [*self._notes, *log.notes]
         if self._session is not None:
             notes.append(self._session.summary())
-            if not self._session.report.valid:
-                outcome, reason = Outcome.UNSET, "invalid: " + "; ".join(self._session.report.faults or ())
+            if self._session.faults:
+                outcome, reason = Outcome.UNSET, "invalid: " + "; ".join(self._session.faults)
         record = FlightRecord(
             gain_set=job.gain_set,
             vehicle_spec=job.model.spec,

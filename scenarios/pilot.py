@@ -76,6 +76,8 @@ class Pilot:
         sampled: Sequence[int] = SAMPLED,
     ) -> None:
         self._sampled = sampled
+        self.watch: Callable[[], object] = lambda: None
+        """Called fifty times a second from take-off on; what it raises ends the flight."""
         self._client = client
         self._scenario = scenario
         self._say = say
@@ -305,6 +307,7 @@ class Pilot:
         if not self._watching or now_us < self._next_check_us:
             return
         self._next_check_us = now_us + _CHECK_US
+        self.watch()
         state = self._client.state
         if self._tilt() > DIVERGED_RAD:
             raise FlightEndedError(f"diverged: tilt beyond {math.degrees(DIVERGED_RAD):g} deg")

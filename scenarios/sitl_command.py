@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from bridge.clock import ScaledClock
-    from bridge.fleet_status import FleetStatus
 
 EXIT_OK, EXIT_FAILED = 0, 3
 LOOPBACK = "127.0.0.1"
@@ -72,6 +71,7 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
         expand_specs,
         refuses_unsigned,
     )
+    from scenarios.status_line import StatusLine
     from sitl.compiled import is_warm
     from sitl.vehicle_spec import resolve_vehicle
 
@@ -96,7 +96,7 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
     if not is_warm():
         tell("compiling the control laws, once; up to half a minute ...")
     servers = build_fleet([models[spec] for spec in specs], args.instance, options)
-    screen = _Screen(always=args.status, tell=tell)
+    screen = StatusLine(always=args.status, tell=tell)
     try:
         warning = sitl_links.exposure(
             [link for server in servers for link in server.links],
@@ -110,36 +110,12 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
         with stop_on_signals() as stop:
             # This clock starts now: the one before only found out whether the speed makes sense.
             fleet = Fleet(servers, _clock(args.speed), tell=screen.tell, close=close_vehicle)
-            status = fleet.run(stop=stop, report=screen.show if screen.shows else None)
+            status = fleet.run(stop=stop, report=(lambda now: screen.show(now.line())) if screen.shows else None)
         screen.tell(f"served {status.line().strip()}")
     finally:
         for server in servers:
             sitl_links.close_links(server.links)
     return EXIT_FAILED if fleet.failures else EXIT_OK
-
-
-class _Screen:
-    """The status line on standard error: over itself on a terminal, line below line elsewhere if asked for."""
-
-    def __init__(self, *, always: bool, tell: Callable[[str], object]) -> None:
-        self._terminal = sys.stderr is not None and sys.stderr.isatty()
-        self.shows = self._terminal or (always and sys.stderr is not None)
-        self._tell = tell
-        self._dirty = False
-
-    def show(self, status: FleetStatus) -> None:
-        if self._terminal:
-            sys.stderr.write(f"\r{status.line()}\x1b[K")
-            self._dirty = True
-        else:
-            sys.stderr.write(f"{status.line()}\n")
-        sys.stderr.flush()
-
-    def tell(self, text: str) -> None:
-        if self._dirty:
-            sys.stderr.write("\n")
-            self._dirty = False
-        self._tell(text)
 
 
 def _clock(speed: str) -> ScaledClock | None:
