@@ -25,7 +25,7 @@ SLOW_TICKS = 5
 
 TEMPERATURE_DEG_C = 25.0
 _ARMED, _LOCKSTEP = 128, 1
-_PX4, _ARDUPILOT = 12, 3
+_PX4 = 12
 _NOBODY = 8
 _COG_UNKNOWN = 65535
 _KEPT = 64
@@ -87,7 +87,8 @@ class Simulator:
             frames.append(self.connection.encode_fields("HIL_GPS", gps_fields(fix)))
         now_us = self.body.time_us
         if self.truth and self._truth_interval_us is not None and now_us >= self._truth_due_us:
-            self._truth_due_us = now_us + self._truth_interval_us
+            # whole intervals, so that 5 ms asked of a 4 ms tick are 5 ms on average
+            self._truth_due_us = max(self._truth_due_us + self._truth_interval_us, now_us)
             frames.append(self.connection.encode_fields("HIL_STATE_QUATERNION", truth_fields(self.body)))
         frames.append(self.connection.encode_fields("HIL_SENSOR", sensor_fields(self.body)))
         return b"".join(frames)
@@ -161,7 +162,7 @@ def sensor_fields(body: Body) -> dict[str, Any]:
         updated |= MAG | BARO
         fields["xmag"], fields["ymag"], fields["zmag"] = sensors.mag()
         fields["abs_pressure"] = pressure = sensors.pressure()
-        fields["pressure_alt"] = 44330.77 * (1.0 - (pressure / 1013.25) ** 0.1902632)
+        fields["pressure_alt"] = 44330.77 * (1.0 - (max(0.0, pressure) / 1013.25) ** 0.1902632)
         fields["temperature"] = TEMPERATURE_DEG_C
     fields["fields_updated"] = updated
     return fields

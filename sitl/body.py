@@ -25,14 +25,15 @@ START_US = 1_000_000
 """An autopilot's clock is the simulator's: it must not begin at 0."""
 
 LEAST_NOISE = {
-    "gyro_noise_rad_s": 0.0005,
+    "gyro_noise_rad_s": 0.0015,
     "accel_noise_m_s2": 0.005,
     "mag_noise_gauss": 0.0005,
     "baro_noise_hpa": 0.005,
     "gps_noise_m": 0.01,
     "gps_noise_m_s": 0.005,
 }
-"""A sensor that repeats itself exactly is taken for dead: "MAG STALE"."""
+"""A sensor that repeats itself exactly is taken for dead: "MAG STALE". The gyro's is above the autopilot's resolution,
+about 1 mrad/s cut towards zero, or it would read nothing but zeros at rest."""
 
 
 class Body:

@@ -68,8 +68,8 @@ def _metres_per_deg_east(lat_deg: float) -> float:
 
 
 def pressure_hpa(alt_m: float) -> float:
-    """Pressure of the standard atmosphere, hPa, at a height in m AMSL."""
-    return float(1013.25 * (1.0 - 2.25577e-5 * alt_m) ** 5.25588)
+    """Pressure of the standard atmosphere, hPa, at a height in m AMSL; nothing above the 44 km where it ends."""
+    return float(1013.25 * max(0.0, 1.0 - 2.25577e-5 * alt_m) ** 5.25588)
 
 
 @compiled
@@ -138,7 +138,8 @@ class Sensors:
             self._row = 0
         measure_gyro(self._plant.rates, self._noise, self._row, self._profile.gyro_quantum_rad_s, self.gyro)
         if now_us >= self._next_gps_us:
-            self._next_gps_us += self._gps_period_us
+            # from now, not from zero: sensors may begin late, and must not make up for fixes nobody saw
+            self._next_gps_us = now_us - now_us % self._gps_period_us + self._gps_period_us
             self._fix(now_us)
 
     def _fix(self, now_us: int) -> None:
