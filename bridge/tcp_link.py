@@ -177,6 +177,14 @@ class TcpLink(Link):
             other.close()
             anybody = True
 
+    def turn_out(self) -> bool:
+        """Close the connection of the peer, if there is another to come after it; whether it was closed."""
+        if self._listener is None or self._peer is None:
+            return False
+        self._peer.close()
+        self._peer = None
+        return True
+
     def _parted(self, why: str) -> PeerLost:
         if self._peer is not None:
             self._peer.close()
@@ -192,6 +200,15 @@ def refuse_others(link: Link) -> bool:
         link: of any kind.
     """
     return isinstance(link, TcpLink) and link.turn_away()
+
+
+def turn_out(link: Link) -> bool:
+    """Turn the peer of a listening link away, so that another may come; whether it was.
+
+    Args:
+        link: of any kind.
+    """
+    return isinstance(link, TcpLink) and link.turn_out()
 
 
 def _at_once(sock: socket.socket) -> None:
