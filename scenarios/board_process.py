@@ -21,7 +21,7 @@ from bridge.clock import WallClock
 from bridge.errors import BoardStopped, LinkUrlError, PeerLost
 from bridge.ground_router import GroundRouter
 from bridge.link import Link, open_link
-from bridge.realtime import RealTime
+from bridge.realtime import RealTime, be_prompt
 from bridge.simulator import Simulator
 from sitl.body import Body
 from sitl.errors import FroudeError
@@ -99,7 +99,7 @@ def _open(plant: BoardPlant, stack: ExitStack, pipe: Pipe) -> RealTime:
     grounds += [stack.enter_context(ground) for ground in open_grounds(plant.grounds)]
     # the flight's own client asked the user already
     router = GroundRouter(grounds, may_arm=plant.may_arm, say=say)
-    return RealTime(link, Simulator(body, truth=False), router=router, say=say)
+    return RealTime(link, Simulator(body, truth=False), router=router, say=say, preferred=be_prompt())
 
 
 def open_grounds(urls: Sequence[str]) -> list[Link]:

@@ -14,7 +14,7 @@ from bridge.fleet import stop_on_signals
 from bridge.ground_router import GroundRouter
 from bridge.link import Link, open_link
 from bridge.lockstep import Lockstep
-from bridge.realtime import RealTime, RealTimeReport
+from bridge.realtime import RealTime, RealTimeReport, be_prompt
 from bridge.simulator import Simulator
 from scenarios.board_process import open_grounds
 from scenarios.board_session import GROUNDS
@@ -180,6 +180,7 @@ class _Board:
         self._router = GroundRouter(grounds, may_arm=what.may_arm, say=screen.tell)
         self._status = _Every(_STATUS_US, self._clock)
         self._report = RealTimeReport()
+        self._preferred = be_prompt()
         self._stopped = ""
 
     def run(self) -> dict[str, Any]:
@@ -205,7 +206,9 @@ class _Board:
             f"{self._what.model.name} for the board at {link.name}; MAVLink for {names or 'nobody'}. Ctrl-C stops."
         )
         simulator = Simulator(self._body, truth=False)
-        real_time = RealTime(link, simulator, router=self._router, clock=self._clock, say=screen.tell)
+        real_time = RealTime(
+            link, simulator, router=self._router, clock=self._clock, say=screen.tell, preferred=self._preferred
+        )
         real_time.report.faults += self._report.faults
         real_time.report.restarts = self._report.restarts
         self._report = report = real_time.report
