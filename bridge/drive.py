@@ -141,3 +141,37 @@ class NetworkDrive(Drive):
             return PeerSilent(link.name, self.patience_s, awaited, "Is it a MAVLink autopilot (component 1)?")
         remedy = "Is the vehicle running, and does it send to this port? `froude sitl ant-x` starts one"
         return PeerSilent(link.name, self.patience_s, "a MAVLink vehicle", remedy)
+
+
+class ListeningDrive(Drive):
+    """For what needs no vehicle time, such as the parameters of a vehicle whose simulator is absent: wall time.
+
+    Args:
+        patience_s: silence after which the vehicle counts as lost, s. clock: measures the time.
+    """
+
+    def __init__(self, patience_s: float = 5.0, clock: Clock | None = None) -> None:
+        self.patience_s = patience_s
+        self._clock: Clock = clock or WallClock()
+        self._start_us = self._looked_us = self._clock.now_us()
+        self._silent_us = 0
+        self._anything = False
+
+    def now_us(self) -> int:
+        """Wall time since this drive was made, us."""
+        return self._clock.now_us() - self._start_us
+
+    def wait(self, link: Link, until_us: int) -> bytes | None:
+        """Listen for up to 20 ms."""
+        data = link.recv(min(_SLICE_S, max(0.0, (until_us - self.now_us()) * 1e-6)))
+        now = self._clock.now_us()
+        # as in NetworkDrive: a pause of this whole computer is no silence of the vehicle
+        self._silent_us = 0 if data is not None else self._silent_us + min(now - self._looked_us, _LOOK_US)
+        self._looked_us = now
+        self._anything = self._anything or data is not None
+        if self._silent_us > self.patience_s * 1e6:
+            if self._anything:
+                raise PeerLost(link.name, f"nothing from the vehicle for {self.patience_s:g} s")
+            remedy = "Is the vehicle switched on, and does it send to this port?"
+            raise PeerSilent(link.name, self.patience_s, "a MAVLink vehicle", remedy)
+        return data

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from bridge.param_operation import ParamValue
 from bridge.param_protocol import TYPE_NUMBERS
 from sitl.errors import FileError, UsageError
 from sitl.parameters import NAME_LENGTH, ParameterTable, ParameterType, from_raw, to_raw
@@ -104,6 +105,34 @@ def read_parameters(path: Path, table: ParameterTable) -> StoredParameters:
     return stored
 
 
+def read_values(path: Path) -> dict[str, ParamValue]:
+    """Every parameter of a .params file, of whatever vehicle, bit for bit.
+
+    Args:
+        path: the file; it must be there.
+
+    Raises:
+        FileError: it cannot be read, a line makes no sense, or there is none; names the line.
+    """
+    if not path.is_file():
+        raise FileError(path, "is no file", "Give a .params file")
+    values: dict[str, ParamValue] = {}
+    for number, line in enumerate(_read(path).split("\n"), 1):
+        text = line.strip()
+        if not text or text.startswith("#"):
+            continue
+        try:
+            name, type_, raw = _columns(text)
+        except UsageError as error:
+            raise FileError(path, f"line {number}: {error}", "Correct it") from None
+        if name in values:
+            raise FileError(path, f"line {number}: {name} is set twice", "Remove one of the two")
+        values[name] = ParamValue(type_, raw)
+    if not values:
+        raise FileError(path, "holds no parameter", "Give a .params file with the old values")
+    return values
+
+
 def _read(path: Path) -> str:
     """Text of a file, empty if it is not there yet."""
     try:
@@ -128,6 +157,16 @@ def _read(path: Path) -> str:
 
 def _parse(text: str, table: ParameterTable) -> tuple[str, bytes | None]:
     """Name and bytes of one line; None instead of bytes for a name the table does not have. Raises UsageError."""
+    name, type_, raw = _columns(text)
+    if name not in table:
+        return name, None
+    if type_ != table.spec(name).type:
+        raise UsageError(f"{name} is {table.spec(name).type}, the file says {type_}")
+    return name, raw
+
+
+def _columns(text: str) -> tuple[str, ParameterType, bytes]:
+    """Name, type and bytes of one line. Raises UsageError."""
     columns = text.split()
     if len(columns) != len(_COLUMNS):
         raise UsageError(f"{text[:60]!r} has {len(columns)} columns instead of {len(_COLUMNS)} ({', '.join(_COLUMNS)})")
@@ -137,12 +176,7 @@ def _parse(text: str, table: ParameterTable) -> tuple[str, bytes | None]:
     kinds: dict[str, ParameterType] = {str(number): type_ for type_, number in TYPE_NUMBERS.items()}
     if kind not in kinds:
         raise UsageError(f"{name} has type {kind!r}; there are 6 for INT32 and 9 for REAL32")
-    raw = _raw_of(name, kinds[kind], value)
-    if name not in table:
-        return name, None
-    if kinds[kind] != table.spec(name).type:
-        raise UsageError(f"{name} is {table.spec(name).type}, the file says {kinds[kind]}")
-    return name, raw
+    return name, kinds[kind], _raw_of(name, kinds[kind], value)
 
 
 def _raw_of(name: str, type_: ParameterType, text: str) -> bytes:

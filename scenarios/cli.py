@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import json
 import sys
 from collections.abc import Callable, Sequence
 from typing import NoReturn
 
-from scenarios import analyse_command, fly_command, hil_command, sitl_command
+from scenarios import analyse_command, fly_command, hil_command, restore_command, sitl_command
 from scenarios.identification import identify_command
 from scenarios.study import study_command
 from scenarios.tuning import tune_command
@@ -69,6 +70,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     hil_command.add_arguments(sub)
     _vehicle_options(sub)
+
+    sub = add(
+        "restore",
+        _restore,
+        "Give vehicles their own parameters back that a flight which ended badly has left changed. Arms nothing.",
+        "froude restore --connect serial:///dev/ttyACM0:57600",
+    )
+    restore_command.add_arguments(sub)
 
     sub = add(
         "analyse",
@@ -147,8 +156,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _tell(text: str, status: int = EXIT_OK) -> int:
-    if sys.stderr is not None:  # None: closed by whoever started us, and print would write to stdout instead
-        print(f"froude: {text}", file=sys.stderr, flush=True)
+    # None: closed by whoever started us, and print would write to stdout instead. A terminal that has gone away (its
+    # SIGHUP is what we may be telling about) must not end a landing.
+    if sys.stderr is not None:
+        with contextlib.suppress(OSError):
+            print(f"froude: {text}", file=sys.stderr, flush=True)
     return status
 
 
@@ -212,6 +224,10 @@ def _hil(args: argparse.Namespace) -> int:
     from sitl.vehicle_spec import DEFAULT_SCALING
 
     return hil_command.run(args, scaling=_words(args.scaling, DEFAULT_SCALING), seed=_seed(args), tell=_tell)
+
+
+def _restore(args: argparse.Namespace) -> int:
+    return restore_command.run(args, tell=_tell)
 
 
 def _analyse(args: argparse.Namespace) -> int:

@@ -55,14 +55,15 @@ def held() -> Iterator[None]:
     """Keep signals until the end of this block: what it writes is worth the moment it takes.
 
     Raises:
-        KeyboardInterrupt: at the end, for a signal that came in it or in a `landing` before.
+        KeyboardInterrupt: at the end, for a signal that came in it or in a `landing` before; one that is still in its
+            `landing` waits for the end of that.
     """
     _Signals.holding += 1
     try:
         yield
     finally:
         _Signals.holding -= 1
-    if _Signals.waiting and not _Signals.holding:
+    if _Signals.waiting and not _Signals.holding and not (_Signals.landing and _Signals.heard == 1):
         _Signals.waiting = False
         raise KeyboardInterrupt
 

@@ -54,6 +54,15 @@ def companions(names: Collection[str]) -> tuple[str, ...]:
     return tuple(sorted(found - set(names)))
 
 
+def corrected(names: Collection[str]) -> tuple[str, ...]:
+    """Return those of some parameters that a vehicle may correct, each behind the ones that it is corrected against.
+
+    Args:
+        names: of parameters.
+    """
+    return tuple(dict.fromkeys(name for name, _ in _FOLLOWS if name in names))
+
+
 def correct(table: ParameterTable) -> list[str]:
     """Put right what PX4's modules would; a NaN is beyond comparison and stays.
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +15,26 @@ from sitl.vehicle import Vehicle
 from sitl.vehicle_spec import VehicleModel, resolve_vehicle
 
 Each = Callable[[int], None]
+
+_states = itertools.count(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def states(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Where journals of borrowed parameters go in tests; the user's own are not touched, nor acted upon."""
+    base = tmp_path_factory.mktemp("states")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FROUDE_STATE_DIR", str(base / "0"))
+        yield base
+
+
+@pytest.fixture(autouse=True)
+def state_dir(states: Path) -> Iterator[Path]:
+    """A state folder of this test's own; it is made when something is kept."""
+    folder = states / str(next(_states))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FROUDE_STATE_DIR", str(folder))
+        yield folder
 
 
 class Flight:

@@ -205,7 +205,8 @@ class TestOverUdp:
         status, _, (last,) = ended(process)
         assert status == 130
         backup = folder / "flights" / "2_2_ant-x.backup.params"
-        assert f"The vehicle's own parameters were NOT restored: load {backup}" in last
+        assert "The vehicle's own parameters were NOT restored: run `froude restore` (they are in " in last
+        assert f", and in {backup})" in last
         readable(folder)
 
     def test_a_vehicle_that_dies_in_flight(self, serve: Any, quick: Path, tmp_path: Path) -> None:
@@ -217,7 +218,7 @@ class TestOverUdp:
         status, out, (line,) = ended(process)
         assert status == 3
         assert line.startswith(f"froude: udpin://127.0.0.1:{port} went away: nothing new from the vehicle for 5 s. ")
-        assert f"NOT restored: load {folder}" in line
+        assert "NOT restored: run `froude restore` (they are in " in line
         assert line.endswith(f"What was flown is in {folder}")
         assert "The run was interrupted" in out
         (flight,) = readable(folder)["flights"]

@@ -257,7 +257,7 @@ class TestTheVehicleIsGivenBack:
         assert _values(vehicles[0].parameters) == vehicles[0].parameters_before
 
     def test_a_vehicle_that_went_away_is_told_with_what_is_left_to_do(
-        self, quick_job: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+        self, quick_job: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, state_dir: Path
     ) -> None:
         """The vehicle is another's here: only such a one has to be given back."""
         job = quick_job(job={"folder": tmp_path})
@@ -273,8 +273,10 @@ class TestTheVehicleIsGivenBack:
         with pytest.raises(FlightStoppedError) as stop:
             fly(job, progress)
         assert str(stop.value.cause).startswith("udpin://127.0.0.1:14540 went away")
-        owed = f"The vehicle's own parameters were NOT restored: load {tmp_path / 'set.backup.params'}"
-        assert stop.value.owed == owed
+        (journal,) = (state_dir / "restore").iterdir()
+        backup = tmp_path / "set.backup.params"
+        owed = "The vehicle's own parameters were NOT restored: run `froude restore`"
+        assert stop.value.owed == (owed := f"{owed} (they are in {journal}, and in {backup})")
         assert stop.value.record.warnings == (owed,)
         assert (tmp_path / "set.backup.params").is_file()
 
