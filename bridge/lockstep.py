@@ -113,6 +113,7 @@ class Lockstep:
         self._silent_since_us: int | None = None
         self._said: set[str] = set()
         self._odd_values = (0, 0)
+        self._locked_us = 0
 
     @property
     def connected(self) -> bool:
@@ -162,7 +163,7 @@ class Lockstep:
             left_us = self._next_us - self._clock.now_us()
             answers = self._heard(max(0.0, left_us * 1e-6))
             if answers:
-                self.locked = True
+                self.locked, self._locked_us = True, self.body.time_us
                 if not answers[-1].lockstep:
                     self._fault("the autopilot is built without lockstep: its time is not the plant's")
                 if self._silent_since_us is not None:
@@ -184,7 +185,8 @@ class Lockstep:
                     waited_s = (self._clock.now_us() - began_us) * 1e-6
                     self.report.longest_wait_s = max(self.report.longest_wait_s, waited_s)
                     return answer
-                self.report.out_of_step += 1
+                # what was sent in the free run is answered late, and no fault
+                self.report.out_of_step += answer.time_us > self._locked_us
                 other_us = answer.time_us
             now_us = self._clock.now_us()
             waited_us += min(now_us - looked_us, _SLICE_US)
