@@ -203,7 +203,7 @@ def truth_fields(body: Body) -> dict[str, Any]:
         body: just stepped.
     """
     truth = body.truth
-    lat, lon, altitude_m = geodetic(truth.position_ned())
+    lat, lon, altitude_m = geodetic(truth.position_ned(), body.home)
     p, q, r = truth.rates()
     north, east, down = truth.velocity_ned()
     ax, ay, az = truth.accel_body()

@@ -41,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seconds", type=float, metavar="S", help="stop after this much vehicle time")
     add("--ground", action="append", metavar="URL", help="board: pass MAVLink on to here (14550 and 14540)")
     add("--arm-hardware", action="store_true", help="board: let ground stations arm it: propellers may turn")
+    add("--home", metavar="LAT,LON,ALT", help="where it stands, degrees and metres (default: PX4's, in Zurich)")
     add("--seed", type=int, default=0, metavar="N", help="of sensor noise")
     add("--status", action="store_true", help="a status line every second, also where there is no terminal")
     add("--json", action="store_true", help="print the report at the end, or the findings of --check, as JSON")
@@ -59,7 +60,9 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
     from bridge.sitl_links import check_instances
     from sitl.compiled import is_warm
     from sitl.errors import UsageError
+    from sitl.geomagnetism import home_of
     from sitl.profile import get_profile
+    from sitl.sensors import ORIGIN
     from sitl.vehicle_spec import resolve_vehicle
 
     check_instances(args.instance, 1)
@@ -83,6 +86,7 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
         seed=seed,
         speed=_speed(args.speed),
         seconds=args.seconds,
+        home=home_of(args.home) if args.home else ORIGIN,
         grounds=None if args.ground is None else tuple(args.ground),
         may_arm=args.arm_hardware,
         status=args.status,

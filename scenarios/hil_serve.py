@@ -23,6 +23,7 @@ from sitl.body import Body
 from sitl.errors import FroudeError, UsageError
 from sitl.profile import Profile
 from sitl.rotation import to_euler
+from sitl.sensors import ORIGIN
 from sitl.vehicle_spec import VehicleModel
 
 _STATUS_US = 1_000_000
@@ -40,6 +41,7 @@ class Serving:
         link: URL of the autopilot. model, profile, seed: the plant.
         speed: vehicle seconds per second at most, None for as fast as the autopilot; a board's is 1.
         seconds: of vehicle time after which it stops; None: never.
+        home: latitude and longitude in deg, height above mean sea level in m.
         grounds: URLs that a board's MAVLink goes to; None: where a PX4's goes. may_arm: they may arm it.
         status: a status line every second even where there is no terminal.
     """
@@ -50,6 +52,7 @@ class Serving:
     seed: int
     speed: float | None = None
     seconds: float | None = None
+    home: tuple[float, float, float] = ORIGIN
     grounds: tuple[str, ...] | None = None
     may_arm: bool = False
     status: bool = False
@@ -82,7 +85,7 @@ def serve(what: Serving, tell: Tell) -> dict[str, Any]:
 
 
 def _serve_lockstep(what: Serving, screen: StatusLine) -> dict[str, Any]:
-    body = Body(what.model, what.profile, seed=what.seed)
+    body = Body(what.model, what.profile, seed=what.seed, home=what.home)
     with open_link(what.link) as link, stop_on_signals() as stop:
         if link.exposed is not None:
             screen.tell(f"open to other computers at {link.exposed[0]}:{link.exposed[1]}: whoever connects first flies")
@@ -175,7 +178,7 @@ class _Board:
         self._stop = stop
         self._grounds = grounds
         self._clock = WallClock()
-        self._body = Body(what.model, what.profile, seed=what.seed)
+        self._body = Body(what.model, what.profile, seed=what.seed, home=what.home)
         self._began_us = self._body.time_us
         self._router = GroundRouter(grounds, may_arm=what.may_arm, say=screen.tell)
         self._status = _Every(_STATUS_US, self._clock)

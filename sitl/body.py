@@ -11,10 +11,11 @@ import numpy as np
 from sitl.actuators import MAX_MOTORS
 from sitl.control_settings import mix_of
 from sitl.errors import UsageError
+from sitl.geomagnetism import earth_field_gauss
 from sitl.parameters import ParameterTable
 from sitl.plant import Plant
 from sitl.profile import Profile
-from sitl.sensors import EARTH_FIELD_GAUSS, GPS_PERIOD_US, Gps, Sensors
+from sitl.sensors import EARTH_FIELD_GAUSS, GPS_PERIOD_US, ORIGIN, Gps, Sensors
 from sitl.vehicle import Truth, airframe_parameters
 from sitl.vehicle_spec import VehicleModel
 
@@ -43,7 +44,7 @@ class Body:
         model: derivatives, body, assumptions.
         profile: of which motor lag, transport delay and noise are used; the autopilot's items are its own business.
         seed: of the noise.
-        field_gauss: magnetic field at the origin, NED, gauss.
+        home: where it stands: latitude and longitude in deg, height above mean sea level in m.
         gps_delay_ticks: a fix is handed over so much later, as a receiver does.
         gps_period_us: between two fixes.
 
@@ -59,7 +60,7 @@ class Body:
         profile: Profile,
         *,
         seed: int = 0,
-        field_gauss: tuple[float, float, float] = EARTH_FIELD_GAUSS,
+        home: tuple[float, float, float] = ORIGIN,
         gps_delay_ticks: int = 2,
         gps_period_us: int = GPS_PERIOD_US,
     ) -> None:
@@ -72,7 +73,8 @@ class Body:
         self.profile = sensed(profile)
         self.seed = seed
         self.tick = 0
-        self._field_gauss = field_gauss
+        self.home = home
+        self._field_gauss = EARTH_FIELD_GAUSS if home == ORIGIN else earth_field_gauss(*home)
         self._gps_delay_ticks = gps_delay_ticks
         self._gps_period_us = gps_period_us
         self._commands = np.zeros(MAX_MOTORS)
@@ -126,6 +128,7 @@ class Body:
             self.plant,
             self.profile,
             self.seed,
+            origin=self.home,
             field_gauss=self._field_gauss,
             gps_period_us=self._gps_period_us,
         )

@@ -20,8 +20,8 @@ from sitl.profile import Profile
 from sitl.rotation import to_body
 
 _BLOCK = 1024
-EARTH_FIELD_GAUSS = (0.215, 0.006, 0.427)
-"""Magnetic field at the origin (Zurich), NED, gauss."""
+EARTH_FIELD_GAUSS = (0.215231, 0.013340, 0.432900)
+"""Magnetic field at ORIGIN, NED, gauss: `sitl.geomagnetism.earth_field_gauss` there."""
 _METRES_PER_DEG = 111_319.49
 GPS_PERIOD_US = 100_000
 
@@ -96,6 +96,7 @@ class Sensors:
 
     Args:
         plant: what moves. profile: noise levels. seed: of the noise.
+        origin: where its position 0 is: latitude and longitude in deg, height above mean sea level in m.
         field_gauss: magnetic field at the origin, NED, gauss. gps_period_us: between two fixes.
     """
 
@@ -105,6 +106,7 @@ class Sensors:
         profile: Profile,
         seed: int,
         *,
+        origin: tuple[float, float, float] = ORIGIN,
         field_gauss: tuple[float, float, float] = EARTH_FIELD_GAUSS,
         gps_period_us: int = GPS_PERIOD_US,
     ) -> None:
@@ -120,11 +122,12 @@ class Sensors:
             + [profile.mag_noise_gauss] * 3
             + [profile.baro_noise_hpa]
         )
+        self._origin = origin
         self._field_gauss = field_gauss
         self._gps_period_us = gps_period_us
         self._next_gps_us = 0
         self.gyro = np.zeros(3)
-        self._gps = Gps(0, *ORIGIN, (0.0, 0.0, 0.0))
+        self._gps = Gps(0, *origin, (0.0, 0.0, 0.0))
 
     def sample(self, now_us: int) -> None:
         """Read all sensors once; ``gyro`` (3,) rad/s is ready afterwards.
@@ -147,7 +150,7 @@ class Sensors:
         position = np.array(self._plant.position_ned()) + spread[:3] * self._profile.gps_noise_m
         velocity = np.array(self._plant.velocity_ned()) + spread[3:] * self._profile.gps_noise_m_s
         north, east, down = velocity.tolist()
-        self._gps = Gps(now_us, *geodetic(tuple(position.tolist())), (north, east, down))
+        self._gps = Gps(now_us, *geodetic(tuple(position.tolist()), self._origin), (north, east, down))
 
     def gps(self) -> Gps:
         """The last fix (10 Hz)."""
@@ -166,4 +169,4 @@ class Sensors:
 
     def pressure(self) -> float:
         """Static pressure, hPa."""
-        return pressure_hpa(ORIGIN[2] - float(self._plant.x[2])) + float(self._noise[self._row % _BLOCK, 9])
+        return pressure_hpa(self._origin[2] - float(self._plant.x[2])) + float(self._noise[self._row % _BLOCK, 9])
