@@ -56,7 +56,8 @@ class FlightJob:
         """The airframe's parameters with this job's on top: what the vehicle holds in flight."""
         table = ParameterTable(airframe_parameters(self.model, self.profile))
         for name, (value, _) in self.parameters.items():
-            table.set(name, value)
+            if name in table:  # a board has output functions that a simulator has not
+                table.set(name, value)
         return table
 
     @property
