@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 from collections import deque
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,18 @@ from sitl.vehicle import Estimate, Vehicle
 from sitl.vehicle_spec import VehicleModel, resolve_vehicle
 
 Vec3 = tuple[float, float, float]
+
+
+@cache
+def warm() -> None:
+    """Compile whatever a flight needs: a board that stops for that in the air falls down."""
+    vehicle = Vehicle(resolve_vehicle("ant-x"), get_profile("sitl"))
+    while not vehicle.autopilot.healthy:
+        vehicle.step()
+    vehicle.autopilot.command_arm(True)
+    vehicle.autopilot.command_takeoff(None)
+    for _ in range(1000):
+        vehicle.step()
 
 
 class WireSensors(Sensors):

@@ -108,7 +108,7 @@ class Rules:
     def gps(self, message: Message) -> None:
         if message.time_usec <= self._fix_us:
             self.problem("a fix that is not newer than the one before")
-        if message.time_usec > self.last_us + 100_000:
+        if self.last_us and message.time_usec > self.last_us + 100_000:
             self.problem("a fix from the future")
         self._fix_us = message.time_usec
         # what a PX4 takes as accuracy in cm: below a centimetre or above five metres no flight would begin
