@@ -21,7 +21,7 @@ MODEL = "none_iris"
 
 MOST_INSTANCES = 10
 _STOP_S = 2.0
-_PR_CAPBSET_DROP, _CAP_SYS_NICE = 24, 23
+_PR_SET_PDEATHSIG, _PR_CAPBSET_DROP, _CAP_SYS_NICE = 1, 24, 23
 
 
 class Px4Process:
@@ -90,7 +90,7 @@ class Px4Process:
                     stdout=log,
                     stderr=subprocess.STDOUT,
                     start_new_session=True,
-                    preexec_fn=_no_real_time,
+                    preexec_fn=_as_our_own,
                 )  # fmt: skip
         except OSError as error:
             where = error.filename or self.binary
@@ -99,7 +99,8 @@ class Px4Process:
     def check(self) -> None:
         """Raise PeerLost if it has ended by itself, with its last words."""
         if self._process is not None and (status := self._process.poll()) is not None:
-            raise PeerLost("PX4", f"it ended with status {status}: {self.last_words()}. Its output is in {self.log}")
+            how = f"with status {status}" if status >= 0 else f"by signal {-status} ({signal.Signals(-status).name})"
+            raise PeerLost("PX4", f"it ended {how}; it last said: {self.last_words()}. Its output is in {self.log}")
 
     def last_words(self) -> str:
         """The last line it printed."""
@@ -153,7 +154,9 @@ def _free(kind: int, port: int) -> bool:
     return True
 
 
-def _no_real_time() -> None:
-    """Run in the child: with real-time priority, which it takes as root, PX4 starves its simulator."""
+def _as_our_own() -> None:
+    """Run in the child: it ends with us, and as root it gets no real-time priority, with which it starves its plant."""
+    libc = ctypes.CDLL(None)
+    libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.geteuid() == 0:
-        ctypes.CDLL(None).prctl(_PR_CAPBSET_DROP, _CAP_SYS_NICE, 0, 0, 0)
+        libc.prctl(_PR_CAPBSET_DROP, _CAP_SYS_NICE, 0, 0, 0)
