@@ -71,7 +71,6 @@ def encode(owner: Owner, entries: Sequence[JournalEntry]) -> str:
         "parameters": [
             {
                 "name": entry.name,
-                "mavlink_type": TYPE_NUMBERS[entry.value.type],
                 "was": _shown(entry.value),
                 "set_to": None if entry.set_to is None else _shown(entry.set_to),
             }
@@ -109,9 +108,10 @@ def decode(path: Path, data: bytes) -> tuple[Owner, tuple[JournalEntry, ...]]:
         raise FileError(path, f"is no whole journal ({type(error).__name__}: {error})", _GIVE_UP) from None
 
 
-def _shown(value: ParamValue) -> dict[str, str]:
-    """The bits are what counts; the text is for people."""
-    return {"bits": f"0x{int.from_bytes(value.raw, 'little'):08x}", "text": str(value)}
+def _shown(value: ParamValue) -> dict[str, Any]:
+    """Type and bits are what counts; the text is for people."""
+    bits = f"0x{int.from_bytes(value.raw, 'little'):08x}"
+    return {"mavlink_type": TYPE_NUMBERS[value.type], "bits": bits, "text": str(value)}
 
 
 def _owner(held: dict[str, Any]) -> Owner:
@@ -124,16 +124,15 @@ def _owner(held: dict[str, Any]) -> Owner:
 
 
 def _entry(item: dict[str, Any]) -> JournalEntry:
-    name, number = item["name"], item["mavlink_type"]
+    name = item["name"]
     if not (isinstance(name, str) and name.isascii() and 1 <= len(name) <= NAME_LENGTH):
         raise ValueError(f"{name!r} is no parameter's name")
-    if number not in _TYPES:
-        raise ValueError(f"{name} has the type {number!r}")
 
-    def value(shown: dict[str, str]) -> ParamValue:
-        if not _BITS.match(shown["bits"]):
-            raise ValueError(f"{name} has the bits {shown['bits']!r}")
-        return ParamValue(_TYPES[number], int(shown["bits"], 16).to_bytes(4, "little"))
+    def value(shown: dict[str, Any]) -> ParamValue:
+        bits, number = shown["bits"], shown["mavlink_type"]
+        if number not in _TYPES or not _BITS.match(bits):
+            raise ValueError(f"{name} has type {number!r} and bits {bits!r}")
+        return ParamValue(_TYPES[number], int(bits, 16).to_bytes(4, "little"))
 
     return JournalEntry(name, value(item["was"]), None if item["set_to"] is None else value(item["set_to"]))
 
