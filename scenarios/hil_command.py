@@ -73,7 +73,8 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
     profile = get_profile(args.profile or "sitl")
     if not is_warm():
         tell("compiling the control laws, once; up to half a minute ...")
-    if args.check or args.setup:
+    board = link.startswith("serial")
+    if args.check or (args.setup and board):
         status = _with_autopilot(args, link, model, profile, seed, tell)
         if args.check or status != EXIT_OK:
             return status
@@ -87,6 +88,7 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
         speed=_speed(args.speed),
         seconds=args.seconds,
         home=home_of(args.home) if args.home else ORIGIN,
+        setup=_connect_url(args) if args.setup and not board else "",
         grounds=None if args.ground is None else tuple(args.ground),
         may_arm=args.arm_hardware,
         status=args.status,
@@ -95,6 +97,11 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
     if args.json:
         _print(json.dumps(report, indent=2))
     return EXIT_LINK if report["stopped"] else EXIT_OK
+
+
+def _connect_url(args: argparse.Namespace) -> str:
+    """Where a PX4 SITL's MAVLink for programs arrives."""
+    return args.connect or f"udpin://127.0.0.1:{MAVLINK_PORT + args.instance}"
 
 
 def _speed(text: str) -> float | None:
@@ -136,6 +143,8 @@ def _with_autopilot(
         _print(json.dumps([one.as_dict() for one in findings], indent=2))
     elif args.check:
         _print(findings_text(findings))
+        if client is not None and not session.board:
+            tell("a PX4 SITL does not come back to a simulator that left: start it anew before it flies")
     fatal = [one for one in findings if not one.ok and one.fatal]
     if fatal and not args.check:
         tell("; ".join(one.sentence() for one in fatal))
@@ -156,8 +165,7 @@ def _session(
         raise UsageError("--check and --setup speak PX4's parameters: not with --link json://")
     from scenarios.hil_session import HilSession
 
-    connect = args.connect or f"udpin://127.0.0.1:{MAVLINK_PORT + args.instance}"
-    session = HilSession(link, connect, model, profile, seed=seed, say=tell)
+    session = HilSession(link, _connect_url(args), model, profile, seed=seed, say=tell)
     session.drive.patience_s = PATIENCE_S
     return session
 

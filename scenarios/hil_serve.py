@@ -8,16 +8,19 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import Any
 
+from bridge.client import Client
 from bridge.clock import Clock, ScaledClock, WallClock
 from bridge.errors import BoardStopped, PeerLost
 from bridge.fleet import stop_on_signals
 from bridge.ground_router import GroundRouter
+from bridge.hil_drive import HilDrive
 from bridge.link import Link, open_link
 from bridge.lockstep import Lockstep
 from bridge.realtime import RealTime, RealTimeReport, be_prompt
 from bridge.simulator import Simulator
 from scenarios.board_process import open_grounds
 from scenarios.board_session import GROUNDS
+from scenarios.hil_session import geometry_parameters
 from scenarios.status_line import StatusLine
 from sitl.body import Body
 from sitl.errors import FroudeError, UsageError
@@ -27,6 +30,7 @@ from sitl.sensors import ORIGIN
 from sitl.vehicle_spec import VehicleModel
 
 _STATUS_US = 1_000_000
+_CONNECT_S = 10.0
 _LOOK_AGAIN_US = 500_000
 _LOOK_STEPS = 25
 
@@ -42,6 +46,7 @@ class Serving:
         speed: vehicle seconds per second at most, None for as fast as the autopilot; a board's is 1.
         seconds: of vehicle time after which it stops; None: never.
         home: latitude and longitude in deg, height above mean sea level in m.
+        setup: MAVLink link on which the airframe's rotors are written into a PX4 SITL first; empty: they are not.
         grounds: URLs that a board's MAVLink goes to; None: where a PX4's goes. may_arm: they may arm it.
         status: a status line every second even where there is no terminal.
     """
@@ -53,6 +58,7 @@ class Serving:
     speed: float | None = None
     seconds: float | None = None
     home: tuple[float, float, float] = ORIGIN
+    setup: str = ""
     grounds: tuple[str, ...] | None = None
     may_arm: bool = False
     status: bool = False
@@ -75,9 +81,13 @@ def serve(what: Serving, tell: Tell) -> dict[str, Any]:
         return _serve_board(what, screen)
     if what.link.startswith("tcpin"):
         return _serve_lockstep(what, screen)
+    if what.link.startswith("json"):
+        from scenarios.hil_json import serve_json
+
+        return serve_json(what, screen)
     raise UsageError(
         f"--link {what.link}: PX4 SITL connects over TCP (tcpin://127.0.0.1:4560), a board is on a serial port "
-        "(serial:///dev/ttyACM0:921600)"
+        "(serial:///dev/ttyACM0:921600), ArduPilot speaks JSON over UDP (json://127.0.0.1:9002)"
     )
 
 
@@ -92,13 +102,17 @@ def _serve_lockstep(what: Serving, screen: StatusLine) -> dict[str, Any]:
         lockstep = Lockstep(link, Simulator(body, truth=True), say=screen.tell)
         screen.tell(
             f"{what.model.name} waits for a PX4 at {link.name} (start it with PX4_SIM_MODEL=none_iris); "
-            "its rotors are not PX4's default: froude hil --setup or froude fly writes them. Ctrl-C stops."
+            + ("" if what.setup else "its rotors are not PX4's default: --setup or froude fly writes them. ")
+            + "Ctrl-C stops."
         )
-        pace = _Pace(body, what.speed)
+        pace, setup = _Pace(body, what.speed), what.setup
         began_us, clock = body.time_us, WallClock()
         wall_us, status = clock.now_us(), _Every(_STATUS_US, clock)
         while not stop() and not _over(what, body.time_us - began_us):
             lockstep.step()
+            if setup and lockstep.locked:
+                _set_up(what, lockstep, screen)
+                setup = ""
             if lockstep.locked:
                 pace.keep()
             else:
@@ -126,6 +140,20 @@ def _serve_lockstep(what: Serving, screen: StatusLine) -> dict[str, Any]:
         "faults": list(report.faults or ()),
         "stopped": "",
     }
+
+
+def _set_up(what: Serving, lockstep: Lockstep, screen: StatusLine) -> None:
+    """Write the airframe's rotors while the plant goes on: a PX4 whose simulator leaves does not come back.
+
+    Raises:
+        LinkError: they are not in the autopilot.
+    """
+    with open_link(what.setup) as link:
+        client = Client(link, HilDrive(lockstep))
+        client.connect(_CONNECT_S)
+        values = geometry_parameters(what.model)
+        client.upload(values)
+    screen.tell(f"{len(values)} parameters of {what.model.airframe.name}'s rotors written and read back")
 
 
 def _lockstep_line(lockstep: Lockstep) -> str:
