@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from scenarios.gain_set import GainSet
 from scenarios.limits import Metric, Outcome
 from scenarios.scenario import Scenario
 from scenarios.telemetry import Telemetry
+
+if TYPE_CHECKING:
+    from scenarios.twin import Twin
 
 
 @dataclass(frozen=True)
@@ -111,6 +114,7 @@ class RunRecord:
         started_utc: ISO 8601; in no hash.
         versions: program and libraries.
         complete: False if the run was interrupted.
+        twins: where a real autopilot flew our plant: its flights beside those of our own, the baseline's too.
     """
 
     scenario: Scenario
@@ -121,3 +125,4 @@ class RunRecord:
     started_utc: str = ""
     versions: Mapping[str, str] = field(default_factory=dict)
     complete: bool = True
+    twins: tuple[Twin, ...] = ()

@@ -46,6 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--connect", metavar="URL", help="fly this vehicle, such as udpin://127.0.0.1:14540")
     add("--hil", metavar="URL", help="fly the plant with a real PX4 that connects here: tcpin://127.0.0.1:4560")
     add("--px4", type=Path, metavar="DIR", help="start this PX4 build for every flight and fly the plant with it")
+    add("--no-twin", action="store_true", help="with --hil, --px4: do not fly the same with our own autopilot")
     add("--arm-hardware", action="store_true", help="allow arming on a serial link: propellers may turn")
     add("--seed", type=int, metavar="N", help="of sensor noise")
     add("--jobs", type=int, default=1, metavar="N", help="flights at a time (default: 1)")
@@ -101,6 +102,7 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...] | None, seed: int 
         hil=args.hil or "",
         px4=args.px4,
         say=tell,
+        twin=not args.no_twin,
     )
     # Rerun's own log lines come from other threads, right through the table; what they say we find out ourselves.
     os.environ.setdefault("RUST_LOG", "off")

@@ -3,6 +3,7 @@
     <utc>_<scenario>_<vehicle>/
         run.json  compare.rrd  junit.xml
         flights/<gain set>.rrd .parquet .tlog .params .backup.params
+        flights/<gain set>.own.rrd ...     the same gains with our own autopilot, beside a real one
 
 Every file is written under a temporary name beside its place and moved, so a file that is there is whole.
 """
@@ -25,6 +26,7 @@ from scenarios.table import own_flight, own_gains_fly
 from sitl.errors import FileError
 
 if TYPE_CHECKING:
+    from scenarios.twin import Twin
     from sitl.vehicle_spec import VehicleModel
 
 SCHEMA_VERSION = 2
@@ -180,10 +182,37 @@ def run_object(run: RunRecord, folder: RunFolder | None = None, command: Sequenc
         "passed": sum(flight.outcome is Outcome.PASS for flight in run.flights),
         "flights": flights,
         "baseline": None if run.baseline is None else _flight_object(run.baseline, folder),
+        "twins": [_twin_object(twin, folder) for twin in run.twins],
     }
 
 
-def _flight_object(flight: FlightRecord, folder: RunFolder | None) -> dict[str, Any]:
+def _twin_object(twin: Twin, folder: RunFolder | None) -> dict[str, Any]:
+    from scenarios.twin import OWN_SUFFIX, QUANTITIES
+
+    difference = twin.difference
+    return {
+        "gain_set": twin.name,
+        "outcome": twin.flight.outcome.value,
+        "own_outcome": twin.own.outcome.value,
+        "verdicts_agree": difference.verdicts_agree,
+        "agree": difference.agree,
+        "cycling": difference.cycling,
+        "alone": list(difference.alone),
+        "outside": [one.name for one in difference.outside()],
+        "quantities": [
+            {
+                **plain(one),
+                "unit": one.unit,
+                "tolerance": one.tolerance,
+                "meaning": QUANTITIES[one.name][2],
+            }
+            for one in difference.quantities
+        ],
+        "own": _flight_object(twin.own, folder, OWN_SUFFIX),
+    }
+
+
+def _flight_object(flight: FlightRecord, folder: RunFolder | None, suffix: str = "") -> dict[str, Any]:
     gain_set = flight.gain_set
     return {
         "gain_set": {
@@ -205,7 +234,7 @@ def _flight_object(flight: FlightRecord, folder: RunFolder | None) -> dict[str, 
         "events": plain(flight.events),
         "rows": len(flight.telemetry),
         "telemetry_sha256": flight.telemetry_sha256,
-        "files": {} if folder is None else folder.flight_files(gain_set.slug),
+        "files": {} if folder is None else folder.flight_files(gain_set.slug + suffix),
     }
 
 

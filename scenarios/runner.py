@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import get_context
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bridge.clock import utc_stamp
 from scenarios import interrupts
@@ -18,6 +19,7 @@ from scenarios.flight import FlightRecord, RunRecord
 from scenarios.flown import Flown, Progress
 from scenarios.gain_set import GainSet, check, flies_gains, flight_gain_parameters, load_all
 from scenarios.hil_session import geometry_parameters
+from scenarios.limits import Outcome
 from scenarios.one_flight import MEMORY, FlightJob, FlightStoppedError, fly
 from scenarios.run_folder import RunFolder, vehicle_description
 from scenarios.scenario import Scenario
@@ -26,6 +28,9 @@ from sitl.parameters import ParameterTable, ParameterType
 from sitl.profile import Profile
 from sitl.vehicle import airframe_parameters
 from sitl.vehicle_spec import VehicleModel
+
+if TYPE_CHECKING:
+    from scenarios.twin import Twin
 
 __all__ = ["Progress", "RunOptions", "RunResult", "plan", "run_scenario", "versions"]
 
@@ -43,9 +48,11 @@ class RunOptions:
         jobs: flights at a time; more than one only for vehicles of our own.
         live_port: port that serves viewers while flying; None for none.
         command: as typed, for run.json.
-        hil: simulator link on which a real autopilot flies our plant, `tcpin://127.0.0.1:4560`; empty for none.
+        hil: simulator link on which a real autopilot flies our plant, `tcpin://127.0.0.1:4560`, or the serial port of
+            a board; empty for none.
         px4: build directory of a PX4 that is started for every flight; None for none.
         say: called with a line for people.
+        twin: where a real autopilot flies our plant, our own flies it, too, to compare the two.
     """
 
     out: Path | None = Path("logs")
@@ -57,6 +64,7 @@ class RunOptions:
     hil: str = ""
     px4: Path | None = None
     say: Callable[[str], object] = lambda _: None
+    twin: bool = True
 
     def __post_init__(self) -> None:
         """Raise UsageError for options that exclude each other, before anything is read."""
@@ -67,7 +75,17 @@ class RunOptions:
             )
         if self.px4 is not None and (self.hil or self.connect != MEMORY):
             raise UsageError("--px4 starts an autopilot with ports of its own: leave out --hil and --connect")
-        if self.hil and self.connect == MEMORY:
+        if self.is_board and not self.arm_hardware:
+            raise UsageError(
+                f"--hil {self.hil}: a serial port leads to real hardware, and nothing is armed there without "
+                "--arm-hardware. Take the propellers off first"
+            )
+        if self.is_board and self.connect != MEMORY:
+            raise UsageError(
+                f"--hil {self.hil} --connect {self.connect}: a board's MAVLink comes over the same port; leave out "
+                "--connect"
+            )
+        if self.hil and self.connect == MEMORY and not self.is_board:
             raise UsageError(
                 f"--hil {self.hil}: say also where the autopilot's MAVLink arrives, such as "
                 "--connect udpin://127.0.0.1:14540"
@@ -80,6 +98,11 @@ class RunOptions:
             raise UsageError("--jobs above 1 needs vehicles of our own; leave out --connect or fly one at a time")
         if self.jobs > 1 and self.live_port is not None:
             raise UsageError("--live shows one flight at a time: leave out --jobs, or --live")
+
+    @property
+    def is_board(self) -> bool:
+        """A board on a serial port flies our plant."""
+        return self.hil.startswith("serial")
 
     @property
     def is_hil(self) -> bool:
@@ -129,17 +152,26 @@ def run_scenario(
     started_utc = utc_stamp()
     if options.out is not None:
         folder = RunFolder.create(options.out, started_utc, scenario.name, model.name)
+    planned = [candidate for candidate in (*candidates, baseline) if candidate is not None]
     jobs = [
         replace(
             job,
             folder=folder.path / "flights" if folder else None,
-            connect=options.connect,
-            parameters={**(geometry_parameters(model) if options.is_hil else {}), **job.parameters},
+            connect=options.hil if options.is_board else options.connect,
+            parameters={
+                **(geometry_parameters(model, board=options.is_board) if options.is_hil else {}),
+                **job.parameters,
+            },
             live_port=options.live_port,
+            command=options.command,
         )
-        for job in (*candidates, *([baseline] if baseline else []))
+        for job in planned
     ]
-    flown = _fly_real(jobs, options, progress) if options.is_hil else _fly_all(jobs, options.jobs, progress)
+    twins: tuple[Twin, ...] = ()
+    if options.is_hil:
+        flown, twins = _fly_real(jobs, planned, options, progress)
+    else:
+        flown = _fly_all(jobs, options.jobs, progress, options.say)
     records, stopped = flown.records, flown.stopped
     if stopped is not None:
         records = {index: record for index, record in records.items() if len(record.telemetry)}
@@ -157,6 +189,7 @@ def run_scenario(
         started_utc=_extended(started_utc),
         versions=versions(),
         complete=stopped is None,
+        twins=twins,
     )
     if folder is not None:
         progress(Progress(len(jobs), len(jobs), "run", "write"))
@@ -221,13 +254,69 @@ def _baseline(
     return plan(gain_set, scenario, model, profile)
 
 
-def _fly_real(jobs: Sequence[FlightJob], options: RunOptions, progress: Callable[[Progress], object]) -> Flown:
+def _fly_real(
+    jobs: Sequence[FlightJob],
+    planned: Sequence[FlightJob],
+    options: RunOptions,
+    progress: Callable[[Progress], object],
+) -> tuple[Flown, tuple[Twin, ...]]:
+    """Fly with the real autopilot, then with our own.
+
+    Args:
+        jobs: for the real one. planned: the same without what only a real one must be told, for ours.
+        options: of the run. progress: as in `run_scenario`.
+
+    Returns:
+        what came back from the real one, with what stopped either; the pairs.
+    """
     from scenarios.hil_flights import fly_with_autopilot
 
-    return fly_with_autopilot(jobs, hil=options.hil, px4=options.px4, say=options.say, progress=progress)
+    count = len(jobs) * (2 if options.twin else 1)
+    flown = fly_with_autopilot(
+        jobs,
+        hil=options.hil,
+        px4=options.px4,
+        say=options.say,
+        progress=lambda now: progress(replace(now, count=count)),
+    )
+    if not options.twin or isinstance(flown.stopped, KeyboardInterrupt):
+        return flown, ()
+    return flown, _fly_twins(jobs, planned, flown, progress)
 
 
-def _fly_all(jobs: Sequence[FlightJob], workers: int, progress: Callable[[Progress], object]) -> Flown:
+def _fly_twins(
+    jobs: Sequence[FlightJob], planned: Sequence[FlightJob], flown: Flown, progress: Callable[[Progress], object]
+) -> tuple[Twin, ...]:
+    """Our own autopilot flies what the real one has flown; what stops it is told like what stopped the other."""
+    from scenarios.twin import OWN_SUFFIX, Twin
+
+    twins = []
+    for index, record in sorted(flown.records.items()):
+        if not record.segments and record.outcome is Outcome.UNSET:
+            continue  # the flight was broken off before there was anything to compare
+        job = replace(planned[index], folder=jobs[index].folder, suffix=OWN_SUFFIX)
+        where, name = len(jobs) + index, f"{job.gain_set.name}, own autopilot"
+        try:
+            own = fly(
+                job,
+                lambda phase, i=where, n=name: progress(Progress(i, 2 * len(jobs), n, phase)),  # type: ignore[misc]
+            )
+        except FlightStoppedError as stop:
+            flown.stopped = flown.stopped or stop.cause
+            break
+        except KeyboardInterrupt as stop_:
+            flown.stopped = flown.stopped or stop_
+            break
+        twins.append(Twin.of(record, own))
+    return tuple(twins)
+
+
+def _fly_all(
+    jobs: Sequence[FlightJob],
+    workers: int,
+    progress: Callable[[Progress], object],
+    say: Callable[[str], object],
+) -> Flown:
     if workers > 1 and len(jobs) > 1:
         return _fly_side_by_side(jobs, workers, progress)
     flown = Flown()
@@ -237,6 +326,7 @@ def _fly_all(jobs: Sequence[FlightJob], workers: int, progress: Callable[[Progre
             flown.records[index] = fly(
                 job,
                 lambda phase, i=index, n=name: progress(Progress(i, len(jobs), n, phase)),  # type: ignore[misc]
+                say=say,
             )
         except FlightStoppedError as stop:
             flown.records[index] = stop.record

@@ -78,6 +78,11 @@ COLUMNS: tuple[TableColumn, ...] = (
     TableColumn("delay/margin", "ms", ("delay_margin_s",), _fixed(1, 1000.0)),
 )
 
+WIDE = 98
+"""Columns of a terminal from which on everything fits; below it what `SPARED` names is left to run.json."""
+
+SPARED = ("settling_time_2pct_s", "rms_error_deg", "peak_delta_lat")
+
 STYLES: Mapping[Outcome, str] = {
     Outcome.PASS: "green",
     Outcome.FAIL: "red",
@@ -221,13 +226,15 @@ def run_text(
         markup=False,
         legacy_windows=False,
     )
-    console.print(_rich_table(run.flights))
+    console.print(_rich_table(run.flights, columns))
     for flight in run.flights:
         for index, note in enumerate(notes(flight)):
             lead = f"  {flight.gain_set.name}: " if index == 0 else "    "
             console.print(_wrapped(lead + note, columns, "      "))
     for line in blank_cells(run.flights):
         console.print(_wrapped(f"  {line}", columns, "      "))
+    if run.twins:
+        _print_twins(console, run, columns)
     tail = []
     own = own_gains_line(run)
     if own:
@@ -248,24 +255,39 @@ def run_text(
     return "\n".join(line.rstrip() for line in sink.getvalue().splitlines()) + "\n"
 
 
+def _print_twins(console: Any, run: RunRecord, columns: int) -> None:
+    """Real and own autopilot beside each other, and where they are further apart than is tolerated."""
+    from scenarios import twin_table
+
+    console.print()
+    console.print(_wrapped(twin_table.headline(run.twins), columns, "  "))
+    response, rest = twin_table.rich_tables(run.twins, columns)
+    console.print(response)
+    for line in twin_table.remarks(run.twins):
+        console.print(_wrapped(f"  {line}", columns, "      "))
+    console.print("\nAUTO modes, ground, estimate, saturation: real/own")
+    console.print(rest)
+
+
 def _wrapped(text: str, columns: int, indent: str) -> str:
     return textwrap.fill(text, columns, subsequent_indent=indent, break_on_hyphens=False, break_long_words=False)
 
 
-def _rich_table(flights: Sequence[FlightRecord]) -> Any:
+def _rich_table(flights: Sequence[FlightRecord], width: int) -> Any:
     from rich import box
     from rich.table import Table
     from rich.text import Text
 
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
     table.add_column("gain set", overflow="fold")
-    for column in COLUMNS:
+    shown = [k for k, column in enumerate(COLUMNS) if width >= WIDE or column.metrics[0] not in SPARED]
+    for column in (COLUMNS[k] for k in shown):
         title = column.title.replace("/", "\n")
         table.add_column(f"{title}\n{column.unit}" if column.unit else title, justify="right", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
     for flight in flights:
-        row = [Text(flight.gain_set.name)]
-        row += [Text(text, style=STYLES[outcome]) for text, outcome in cells(flight)]
+        row, filled = [Text(flight.gain_set.name)], cells(flight)
+        row += [Text(text, style=STYLES[outcome]) for text, outcome in (filled[k] for k in shown)]
         table.add_row(*row, Text(str(flight.outcome), style=f"bold {STYLES[flight.outcome]}".strip()))
     return table
 

@@ -36,6 +36,8 @@ RANKS: Mapping[str, float] = {"oscillates": 1.0, "failed": 1.5, "passed": 2.0, "
 
 SETPOINT: Colour = (235, 235, 235)
 LIMIT: Colour = (150, 150, 150)
+TWIN_WIDTH = 1.0
+"""Line width of our own autopilot's response, drawn on top of a real one's."""
 MEASURED: Colour = PALETTE[0]
 
 
@@ -76,6 +78,17 @@ def candidate_colour(index: int, rank: str) -> tuple[int, int, int, int]:
     """
     grey, opacity = {"oscillates": (0.5, 150), "failed": (0.3, 255)}.get(rank, (0.0, 255))
     red, green, blue = (round((1.0 - grey) * channel + grey * 110) for channel in PALETTE[index % len(PALETTE)])
+    return red, green, blue, opacity
+
+
+def twin_colour(index: int, rank: str) -> tuple[int, int, int, int]:
+    """The same hue, lighter: candidate `index` flown by our own autopilot beside a real one.
+
+    Args:
+        index: its place in the run. rank: as for `candidate_colour`, of the real one's flight.
+    """
+    red, green, blue, opacity = candidate_colour(index, rank)
+    red, green, blue = (round(channel + 0.55 * (255 - channel)) for channel in (red, green, blue))
     return red, green, blue, opacity
 
 
@@ -249,11 +262,12 @@ def _space(page: Page | None) -> Any:
     return rrb.Horizontal(view, plots, column_shares=[1.6, 1.0], name="3D")
 
 
-def compare_blueprint(pages: Sequence[tuple[str, Page]]) -> Any:
+def compare_blueprint(pages: Sequence[tuple[str, Page]], twins: bool = False) -> Any:
     """Layout of a comparison: a tab per manoeuvre, every candidate above the table; then the circumstances.
 
     Args:
         pages: (entity prefix, page) of each manoeuvre; the page's time counts from the manoeuvre's start.
+        twins: there is a document on two autopilots, `/twins`.
     """
     import rerun.blueprint as rrb
 
@@ -276,5 +290,7 @@ def compare_blueprint(pages: Sequence[tuple[str, Page]]) -> Any:
         )
         for prefix, page in pages
     ]
+    if twins:
+        tabs.append(rrb.TextDocumentView(name="Real and own autopilot", origin="/twins"))
     tabs.append(rrb.TextDocumentView(name="Vehicle, assumptions, gains", origin="/circumstances"))
     return _blueprint(tabs, pages[0][1] if pages else None)

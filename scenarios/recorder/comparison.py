@@ -16,7 +16,16 @@ from numpy.typing import NDArray
 
 from scenarios.limits import LIMIT_CYCLE_RAD_S, Outcome
 from scenarios.recorder import blueprints
-from scenarios.recorder.blueprints import BEFORE_S, LIMIT, RANKS, SETPOINT, Page, candidate_colour
+from scenarios.recorder.blueprints import (
+    BEFORE_S,
+    LIMIT,
+    RANKS,
+    SETPOINT,
+    TWIN_WIDTH,
+    Page,
+    candidate_colour,
+    twin_colour,
+)
 from scenarios.recorder.flight_recorder import DEG
 from scenarios.recorder.stream import Recording
 
@@ -25,6 +34,9 @@ if TYPE_CHECKING:
 
 APPLICATION_ID = "froude-compare"
 """The viewer keeps one layout per application id, so comparisons need their own."""
+
+DASHES, DASH = 90, 0.6
+"""Dashes over the width of a page, and the share of each that is drawn."""
 
 BAND = 0.05
 """Half width of the settling band that is drawn, of the step's amplitude."""
@@ -46,7 +58,7 @@ def record_compare(run: RunRecord, path: Path, *, live_port: int | None = None) 
         FileError: it cannot be written.
         UsageError: the port is taken.
     """
-    from scenarios import markdown
+    from scenarios import markdown, twin_table
 
     recording = Recording(
         path,
@@ -58,7 +70,7 @@ def record_compare(run: RunRecord, path: Path, *, live_port: int | None = None) 
     manoeuvres = dict.fromkeys(segment.manoeuvre for flight in run.flights for segment in flight.segments)
     pages = []
     for number, manoeuvre in enumerate(manoeuvres, start=1):
-        parts = _parts(run.flights, manoeuvre)
+        parts = _parts(run.flights, manoeuvre, [twin.own for twin in run.twins])
         if parts:
             prefix = f"/{number}_" + re.sub(r"[^A-Za-z0-9_-]+", "_", manoeuvre)
             pages.append((prefix, _write_manoeuvre(recording, prefix, manoeuvre, parts)))
@@ -66,7 +78,9 @@ def record_compare(run: RunRecord, path: Path, *, live_port: int | None = None) 
     recording.document("/circumstances", markdown.circumstances(run))
     for flight in run.flights:
         recording.properties(flight_properties(flight, prefix=f"{flight.gain_set.slug}_"))
-    recording.layout(blueprints.compare_blueprint(pages))
+    if run.twins:
+        recording.document("/twins", twin_table.markdown(run.twins))
+    recording.layout(blueprints.compare_blueprint(pages, twins=bool(run.twins)))
     return recording.finish()
 
 
@@ -112,7 +126,7 @@ def _ranks(flights: Sequence[FlightRecord]) -> list[str]:
 
 @dataclass(frozen=True)
 class _Part:
-    """One flight's rows of one manoeuvre, time counted from its start."""
+    """One flight's rows of one manoeuvre, time counted from its start; `own`: of our autopilot beside a real one."""
 
     flight: FlightRecord
     number: int
@@ -123,6 +137,17 @@ class _Part:
     phi_deg: NDArray[np.float64]
     p_rad_s: NDArray[np.float64]
     delta_lat: NDArray[np.float64]
+    own: bool = False
+
+    @property
+    def dashed(self) -> bool:
+        """A line of its own kind, where one can see it: what oscillates is all edges already."""
+        return self.own and self.rank != "oscillates"
+
+    @property
+    def width(self) -> float:
+        """Of its line."""
+        return TWIN_WIDTH if self.own else RANKS[self.rank]
 
     @property
     def duration_s(self) -> float:
@@ -133,43 +158,57 @@ class _Part:
         return self.phi_sp_deg - self.phi_deg
 
 
-def _parts(flights: Sequence[FlightRecord], manoeuvre: str) -> list[_Part]:
-    """Of every flight that came to the manoeuvre, the last to be drawn on top last."""
+def _parts(flights: Sequence[FlightRecord], manoeuvre: str, twins: Sequence[FlightRecord] = ()) -> list[_Part]:
+    """Of every flight that came to the manoeuvre, the last to be drawn on top last; own ones right after the real."""
+    owns = {twin.gain_set.slug: twin for twin in twins}
     parts = []
     for number, (flight, rank) in enumerate(zip(flights, _ranks(flights), strict=True)):
-        segments = tuple(segment for segment in flight.segments if segment.manoeuvre == manoeuvre)
-        if not segments:
-            continue
-        start = segments[0].start_s
-        rows = flight.telemetry.between(start - BEFORE_S, segments[-1].end_s)
-        if not len(rows):
-            continue
-        names = ("phi_sp_rad", "phi_rad", "p_rad_s", "delta_lat")
-        phi_sp, phi, p, delta_lat = (rows[name].astype(np.float64) for name in names)
-        parts.append(_Part(flight, number, rank, segments, rows["t_s"] - start, phi_sp * DEG, phi * DEG, p, delta_lat))
+        own = owns.get(flight.gain_set.slug)
+        parts += [_part(flight, number, rank, manoeuvre)]
+        if own is not None:
+            quiet = rank if rank != "oscillates" else "passed"
+            parts += [_part(own, number, "oscillates" if _oscillates(own) else quiet, manoeuvre, own=True)]
     order = list(RANKS)
-    return sorted(parts, key=lambda part: (order.index(part.rank), part.number))
+    known = [part for part in parts if part is not None]
+    return sorted(known, key=lambda part: (order.index(part.rank), part.number, part.own))
+
+
+def _part(flight: FlightRecord, number: int, rank: str, manoeuvre: str, *, own: bool = False) -> _Part | None:
+    segments = tuple(segment for segment in flight.segments if segment.manoeuvre == manoeuvre)
+    if not segments:
+        return None
+    start = segments[0].start_s
+    rows = flight.telemetry.between(start - BEFORE_S, segments[-1].end_s)
+    if not len(rows):
+        return None
+    names = ("phi_sp_rad", "phi_rad", "p_rad_s", "delta_lat")
+    phi_sp, phi, p, delta_lat = (rows[name].astype(np.float64) for name in names)
+    return _Part(
+        *(flight, number, rank, segments, rows["t_s"] - start, phi_sp * DEG, phi * DEG, p, delta_lat),
+        own=own,
+    )
 
 
 def _write_manoeuvre(recording: Recording, prefix: str, manoeuvre: str, parts: Sequence[_Part]) -> Page:
     """Every flight's part of one manoeuvre; returns its page."""
     # A flight that was broken off shows only the beginning of the set-point.
-    longest = max(parts, key=lambda part: part.duration_s)
+    longest = max((part for part in parts if not part.own), key=lambda part: part.duration_s, default=parts[0])
     tracking = any(segment.kind == "track" for segment in longest.segments)
     _write_setpoint(recording, prefix, longest)
     for place, part in enumerate(parts, start=1):
-        best = ", best" if part.rank == "best" else ""
-        name = f"{part.flight.gain_set.name}: {part.flight.outcome}{best}"
+        best = ", best" if part.rank == "best" and not part.own else ""
+        who = ", own autopilot" if part.own else ""
+        name = f"{part.flight.gain_set.name}{who}: {part.flight.outcome}{best}"
         for quantity, unit, values in (
             ("roll", "deg", part.phi_deg),
             ("error", "deg", part.error_deg),
             ("roll_rate", "rad/s", part.p_rad_s),
             ("delta_lat", "-", part.delta_lat),
         ):
-            entity = f"{prefix}/{quantity}/{place:02d}_{part.flight.gain_set.slug}"
-            colour = candidate_colour(part.number, part.rank)
-            recording.style(entity, [f"{name} [{unit}]"], [colour], widths=[RANKS[part.rank]])
-            recording.lines(entity, part.time, values)
+            entity = f"{prefix}/{quantity}/{place:02d}_{part.flight.gain_set.slug}" + ("_own" if part.own else "")
+            colour = (twin_colour if part.own else candidate_colour)(part.number, part.rank)
+            recording.style(entity, [f"{name} [{unit}]"], [colour], widths=[part.width])
+            recording.lines(entity, part.time, _dashed(part.time, values) if part.dashed else values)
     quiet = [part for part in parts if not _oscillates(part.flight)]
     return Page(
         manoeuvre,
@@ -183,6 +222,12 @@ def _write_manoeuvre(recording: Recording, prefix: str, manoeuvre: str, parts: S
         delta_lat=_range([part.delta_lat for part in quiet]),
         tracking=tracking,
     )
+
+
+def _dashed(time: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gaps in a line, `DASHES` of them; the viewer has no dashed lines of its own."""
+    phase = (time - time[0]) * DASHES / (time[-1] - time[0] + 1e-9) % 1.0
+    return np.where(phase < DASH, values, np.nan)
 
 
 def _write_setpoint(recording: Recording, prefix: str, part: _Part) -> None:
