@@ -14,6 +14,9 @@ from bridge.errors import PeerLost, PeerSilent
 from bridge.link import Link
 from bridge.lockstep import Lockstep
 
+LAST_WORDS_S = 0.1
+"""Wall-clock time that a process is given to end after its connection has."""
+
 ARRIVAL_S = 0.003
 """Wall-clock time that a set-point is given to get through the autopilot's own threads before the next tick."""
 
@@ -28,7 +31,7 @@ class HilDrive(Drive):
 
     Attributes:
         each_tick: called after every tick: the flight's recorder of the truth.
-        alive: called while nobody is there: raises if the autopilot's process has ended.
+        alive: called while nobody is there, and when the autopilot went: raises if its process has ended.
     """
 
     def __init__(self, lockstep: Lockstep, patience_s: float = 20.0, clock: Clock | None = None) -> None:
@@ -38,7 +41,7 @@ class HilDrive(Drive):
         self.alive: Callable[[], object] = lambda: None
         self._clock: Clock = clock or WallClock()
         self._alone_since_us: int | None = None
-        self._was_there = False
+        self._left = False
         self._quat: tuple[float, float, float, float] | None = None
         self._hold = False
 
@@ -71,11 +74,17 @@ class HilDrive(Drive):
         before, restarts = self.now_us(), lockstep.report.restarts
         lockstep.step()
         if lockstep.report.restarts != restarts:
+            # a process that ends closes its connection first: its last words say more
+            self._clock.sleep_until_us(self._clock.now_us() + round(LAST_WORDS_S * 1e6))
+            self.alive()
+            self._left = True
             raise PeerLost("the autopilot", "it left the simulator's port")
         if self.now_us() == before:
+            if self._left:
+                raise PeerLost("the autopilot", "it left the simulator's port and is not back")
             self._alone()
             return
-        self._was_there, self._alone_since_us = True, None
+        self._alone_since_us, self._left = None, False
         if self.each_tick is not None:
             self.each_tick()
 

@@ -34,6 +34,9 @@ from sitl.vehicle_spec import VehicleModel, resolve_vehicle
 Vec3 = tuple[float, float, float]
 
 
+_FIRST_MOTOR = 101
+
+
 @cache
 def warm() -> None:
     """Compile whatever a flight needs: a board that stops for that in the air falls down."""
@@ -173,6 +176,9 @@ class AutopilotOnWire:
         model = resolve_vehicle(vehicle) if isinstance(vehicle, str) else vehicle
         self.vehicle = WiredVehicle(model, profile or get_profile("sitl"))
         self.link = open_link(connect) if isinstance(connect, str) else connect
+        # as the start script of a PX4's simulated quadrotor leaves them
+        for n in range(4):
+            self.vehicle.parameters.set(f"PWM_MAIN_FUNC{n + 1}", _FIRST_MOTOR + n)
         served = ServerLink(self.link, Connection(sysid, 1, datagram=self.link.datagram), 0, "onboard")
         self.server = VehicleServer(self.vehicle, [served], strict=True)
         self._last_us = 0
@@ -188,7 +194,10 @@ class AutopilotOnWire:
         self.vehicle.take(sample, dt_s)
         self.server.listen()
         self.server.advance()
-        return self.vehicle.outputs
+        return [
+            motor if self.vehicle.parameters.get(f"PWM_MAIN_FUNC{n + 1}") == _FIRST_MOTOR + n else 0.0
+            for n, motor in enumerate(self.vehicle.outputs)
+        ]
 
     def gps(self, message: Message) -> None:
         self.vehicle.take_fix(message)

@@ -108,7 +108,7 @@ class TestFlight:
     def test_it_hovers_on_sensors_alone(self, line: Callable[..., Line]) -> None:
         one = line()
         one.take_off()
-        one.run(4.0)
+        one.run(2.0)
         north, east, down = one.body.truth.position_ned()
         assert math.hypot(north, east, down + HEIGHT_M) < 0.6
         assert one.worst_deg < 0.5
@@ -126,7 +126,7 @@ class TestFlight:
         wear = Wear(loss=0.01, cut=0.3, delay_s=0.004)
         one = line(wear=wear)
         one.take_off()
-        one.run(3.0)
+        one.run(2.0)
         north, east, down = one.body.truth.position_ned()
         assert math.hypot(north, east, down + HEIGHT_M) < 1.5
         assert wear.lost > 1000
