@@ -121,6 +121,9 @@ class Px4Process:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(_STOP_S)
                 break
+        # what it started itself may not have heard the polite request
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
         # left behind by a kill, they would block the next start of this instance
         for name in (f"px4-sock-{self.instance}", f"px4_lock-{self.instance}"):
             with suppress(OSError):
