@@ -266,7 +266,7 @@ class Plant:
         assumptions: Assumptions,
         mix: Mix,
         *,
-        tick_us: int,
+        tick_us: float,
         motor_lag_s: float,
         delay_ticks: int = 0,
         linear: bool = False,
@@ -274,7 +274,6 @@ class Plant:
         if not 0 <= delay_ticks <= MAX_DELAY_TICKS:
             raise ValueError(f"delay_ticks is {delay_ticks}, want 0..{MAX_DELAY_TICKS}")
         self.tick = 0
-        self.tick_us = tick_us
         self.settings = np.zeros(1, PLANT_SETTINGS)
         self.state = np.zeros(1, PLANT_STATE)
         for name, value in derivatives.as_dict().items():
@@ -287,9 +286,7 @@ class Plant:
         self.settings["inverse"][0, :, : mix.motors] = mix.inverse
         self.settings["motor_count"] = mix.motors
         self.settings["delay_ticks"] = delay_ticks
-        steps = math.ceil(tick_us * 1e-6 / MAX_STEP_S - 1e-9)
-        self.settings["steps"] = steps
-        self.settings["step_s"] = tick_us * 1e-6 / steps
+        self.set_tick(tick_us)
         self.settings["linear"] = linear
         self.linear = linear
         self.x = self.state["x"][0]
@@ -308,6 +305,17 @@ class Plant:
     def lost(self) -> bool:
         """The motion diverged out of all sense, as a loop without limits can. It lies still then, upside down."""
         return bool(self.state["lost"][0])
+
+    def set_tick(self, tick_us: float) -> None:
+        """Go on from here in ticks of another length.
+
+        Args:
+            tick_us: length of a tick, us.
+        """
+        steps = math.ceil(tick_us * 1e-6 / MAX_STEP_S - 1e-9)
+        self.tick_us = tick_us
+        self.settings["steps"] = steps
+        self.settings["step_s"] = tick_us * 1e-6 / steps
 
     def step(self, commands: Floats) -> None:
         """Move by one tick.
