@@ -84,14 +84,17 @@ def lateness(t: FloatArray, signal: FloatArray, ref_t: FloatArray, ref: FloatArr
     if len(t) < _LEAST_ROWS:
         return None
     lates = np.arange(-round(LATEST_S * 1e3), round(LATEST_S * 1e3) + 1) * 1e-3
-    costs = np.array([float(np.mean((signal - np.interp(t - late, ref_t, ref)) ** 2)) for late in lates])
+    # a constant error is not mistaken for lateness: it counts in the RMS alone
+    rests = [signal - np.interp(t - late, ref_t, ref) for late in lates]
+    costs = np.array([float(np.var(rest)) for rest in rests])
     k = int(np.argmin(costs))
+    late_s, left, off = float(lates[k]), costs[k], float(np.mean(rests[k]))
     if 0 < k < len(lates) - 1:
         before, least, after = costs[k - 1 : k + 2]
         bend = before - 2.0 * least + after
         shift = 0.5 * (before - after) / bend if bend > 0.0 else 0.0
-        return float(lates[k] + 1e-3 * shift), math.sqrt(max(0.0, least - 0.25 * (before - after) * shift))
-    return float(lates[k]), math.sqrt(costs[k])
+        late_s, left = late_s + 1e-3 * shift, max(0.0, least - 0.25 * (before - after) * shift)
+    return late_s, math.sqrt(left + off**2)
 
 
 def _hold(flight: FlightRecord) -> dict[str, Fact]:
@@ -206,13 +209,22 @@ def _estimate(flight: FlightRecord) -> dict[str, Fact]:
     names = ("estimate_late_s", "estimate_error_rms_deg")
     if not flight.segments:
         return dict.fromkeys(names, Fact(None, "no manoeuvre was flown"))
-    rows = flight.telemetry.between(flight.segments[0].start_s, flight.segments[-1].end_s)
-    t, phi, true = (rows[name].astype(np.float64) for name in ("t_s", "phi_rad", "phi_true_rad"))
-    known = np.isfinite(true)
-    found = lateness(t, np.unwrap(phi), t[known], np.unwrap(true[known])) if known.sum() > 0.5 * len(t) else None
-    if found is None:
+    found = []
+    # one after the other: between manoeuvres the rows are too far apart to interpolate between
+    for segment in flight.segments:
+        rows = flight.telemetry.between(segment.start_s, segment.end_s)
+        t, phi, true = (rows[name].astype(np.float64) for name in ("t_s", "phi_rad", "phi_true_rad"))
+        known = np.isfinite(true)
+        one = lateness(t, np.unwrap(phi), t[known], np.unwrap(true[known])) if known.sum() > 0.5 * len(t) else None
+        found += [(len(t), len(t) * float(np.var(phi)) + 1e-12, *one)] if one is not None else []
+    if not found:
         return dict.fromkeys(names, Fact(None, "the simulator's truth is not known"))
-    return {names[0]: Fact(found[0]), names[1]: Fact(math.degrees(found[1]))}
+    count, moved, late_s, rms = np.array(found).T
+    return {
+        # how late what hardly moves is cannot be told
+        names[0]: Fact(float(np.average(late_s, weights=moved))),
+        names[1]: Fact(math.degrees(math.sqrt(float(np.average(rms**2, weights=count))))),
+    }
 
 
 def _saturation(flight: FlightRecord) -> dict[str, Fact]:
