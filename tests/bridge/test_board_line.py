@@ -149,7 +149,9 @@ class TestFlight:
 class TestTrouble:
     def test_one_that_falls_silent_in_flight(self, line: Callable[..., Line]) -> None:
         one = line()
-        one.take_off()
+        one.arm()
+        one.run(0.5)
+        assert any(one.real_time.motors)
         one.board.silent = True
         one.run(1.0)
         assert not any(one.real_time.motors)
@@ -157,9 +159,9 @@ class TestTrouble:
 
     def test_one_that_reboots_on_the_ground(self, line: Callable[..., Line]) -> None:
         one = line()
-        one.run(3.0)
+        one.run(1.2)
         one.board.reboot()
-        one.run(3.0)
+        one.run(1.2)
         assert one.real_time.report.restarts == 1
         assert one.real_time.report.valid
 

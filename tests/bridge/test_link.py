@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
@@ -13,7 +14,7 @@ import pytest
 from bridge.errors import LinkClosed, LinkUrlError, PeerLost, PeerSilent, PortBusy
 from bridge.link import Link, LossyLink, MemoryLink, open_link
 from bridge.serial_link import SerialLink
-from bridge.tcp_link import TcpLink
+from bridge.tcp_link import TcpLink, refuse_others, turn_out
 from bridge.udp_link import UdpLink
 from sitl.errors import UsageError
 
@@ -402,3 +403,48 @@ def test_every_kind_of_address_opens() -> None:
             for url in ("udpin://127.0.0.1:0", "udpin://:0", "udpout://localhost:9", "tcpin://localhost:0")
         ]
         assert [link.datagram for link in opened] == [True, True, True, False]
+
+
+class TestWhoMayStay:
+    """A listening TCP link has one peer; the owner of the port decides who."""
+
+    def test_others_are_turned_away_and_the_peer_stays(self) -> None:
+        with TcpLink.listen(LOCAL, 0) as server, TcpLink.connect(LOCAL, server.port) as peer:
+            assert server.recv(0.2) is None
+            assert not refuse_others(server)
+            with TcpLink.connect(LOCAL, server.port) as other:
+                assert until(lambda: refuse_others(server))
+                with pytest.raises(PeerLost):
+                    other.recv(SOON_S)
+            peer.send(b"still here")
+            assert server.recv(SOON_S) == b"still here"
+
+    def test_the_peer_is_turned_out_and_the_next_one_comes_in(self) -> None:
+        with TcpLink.listen(LOCAL, 0) as server, TcpLink.connect(LOCAL, server.port) as peer:
+            peer.send(b"first")
+            assert server.recv(SOON_S) == b"first"
+            with TcpLink.connect(LOCAL, server.port) as waiting:
+                waiting.send(b"second")
+                assert turn_out(server)
+                with pytest.raises(PeerLost):
+                    peer.recv(SOON_S)
+                assert server.recv(SOON_S) == b"second"
+
+    def test_where_nobody_else_can_come_nobody_is_turned_out(self) -> None:
+        near, far = MemoryLink.pair()
+        assert not turn_out(near)
+        assert not refuse_others(near)
+        with TcpLink.listen(LOCAL, 0) as server:
+            assert not turn_out(server)
+            with TcpLink.connect(LOCAL, server.port) as peer:
+                assert not turn_out(peer)
+        far.close()
+
+
+def until(reached: Callable[[], bool]) -> bool:
+    """Whether it is reached soon."""
+    return any(reached() or wait_a_little() for _ in range(500))
+
+
+def wait_a_little() -> None:
+    time.sleep(0.01)

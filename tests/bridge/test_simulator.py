@@ -109,7 +109,7 @@ class TestTheOrderOfATick:
             sim = simulator(profile=profile)
             rules = Rules(asked_for_truth=True)
             sim.receive(Autopilot().ask_for_truth(5000.0))
-            for message in run(sim, 5000, [0.55] * 4):
+            for message in run(sim, 2500, [0.55] * 4):
                 if message.name == "HIL_SENSOR":
                     rules.sensor(message, taken(message))
                 elif message.name == "HIL_GPS":
@@ -244,7 +244,7 @@ class TestHilGps:
         assert set(ages[1:]) == {delay_ticks * 4000}
 
     def test_as_accurate_as_it_says(self) -> None:
-        fixes = named(run(simulator(), 25_000), "HIL_GPS")
+        fixes = named(run(simulator(), 15_000), "HIL_GPS")
         north_m = np.array([(m.lat * 1e-7 - ORIGIN[0]) * 111_319.49 for m in fixes])
         down_m_s = np.array([m.vd * 0.01 for m in fixes])
         profile = get_profile("sitl")
