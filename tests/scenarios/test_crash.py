@@ -162,7 +162,8 @@ class TestOverUdp:
         over_udp = json.loads(out)
         _, out, _ = ended(froude("fly", quick, "--out", tmp_path, "--json"))
         in_memory = json.loads(out)
-        assert [flight["outcome"] for flight in over_udp["flights"]] == ["PASS", "FAIL"]
+        told = [flight["reason"] for flight in over_udp["flights"]]
+        assert [flight["outcome"] for flight in over_udp["flights"]] == ["PASS", "FAIL"], told
         assert [flight["outcome"] for flight in in_memory["flights"]] == ["PASS", "FAIL"]
         quiet, same = over_udp["flights"][0], in_memory["flights"][0]
         for name, within in (("rise_time_s", 0.01), ("overshoot_pct", 0.5), ("droop_deg", 0.2)):
@@ -415,6 +416,28 @@ class TestInterrupts:
         with interrupts.caught(), pytest.raises(KeyboardInterrupt):
             land(2)
         assert done == ["landed", "written"]
+
+    def test_what_is_written_in_the_landing_does_not_end_it(self) -> None:
+        """The journal goes while the vehicle is given back; after it the streams are put back, too."""
+        done: list[str] = []
+
+        def land(signals: int) -> None:
+            with interrupts.landing():
+                signal.raise_signal(signal.SIGINT)
+                with interrupts.held():
+                    for _ in range(signals):
+                        signal.raise_signal(signal.SIGINT)
+                    done.append("journal deleted")
+                done.append("landed")
+            with interrupts.held():
+                done.append("written")
+
+        with interrupts.caught(), pytest.raises(KeyboardInterrupt):
+            land(0)
+        assert done == ["journal deleted", "landed", "written"]
+        with interrupts.caught(), pytest.raises(KeyboardInterrupt):
+            land(1)
+        assert done == ["journal deleted", "landed", "written", "journal deleted"]
 
 
 def test_the_files_of_a_flight_are_there_whole_or_called_partial(tmp_path: Path, quick_job: Any) -> None:
