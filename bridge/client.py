@@ -226,9 +226,7 @@ class Client:
 
     # -- commands ----------------------------------------------------------------------------------------------
 
-    def command(
-        self, name: str, command: int, *params: float, timeout_s: float = 0.0, tries: int = ACK_TRIES
-    ) -> None:
+    def command(self, name: str, command: int, *params: float, timeout_s: float = 0.0, tries: int = ACK_TRIES) -> None:
         """Send a COMMAND_LONG and wait for its COMMAND_ACK; sent again when no answer comes.
 
         Args:
