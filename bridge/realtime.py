@@ -164,6 +164,8 @@ class RealTime:
         self._clock: Clock = clock or WallClock()
         self._say = say
         self._said: set[str] = set()
+        self._faulted: set[str] = set()
+        self._not_numbers = self._outside = 0
         self._preferred = preferred
         self.report.preferred = preferred
         self._began_us = self._next_us = self._sent_us = self._clock.now_us()
@@ -176,6 +178,8 @@ class RealTime:
         self.report = RealTimeReport(preferred=self._preferred)
         self._began_us = self._sent_us = self._clock.now_us()
         self._answered_us = None
+        self._faulted = set()
+        self._not_numbers, self._outside = self.simulator.not_numbers, self.simulator.outside
 
     def step(self) -> None:
         """One tick: hear the board until it is due, move the plant, send what it senses.
@@ -230,9 +234,9 @@ class RealTime:
         self._answered_us = now_us
         self.report.answers += 1
         self.motors, self.armed = actuators.motors, actuators.armed
-        if self.simulator.not_numbers:
+        if self.simulator.not_numbers > self._not_numbers:
             self._fault("a motor command was no number (NaN or infinite), taken for 0")
-        if self.simulator.outside:
+        if self.simulator.outside > self._outside:
             self._fault("a motor command lay outside -1 to 1, cut")
 
     def _take(self, message: Message) -> None:
@@ -318,8 +322,8 @@ class RealTime:
     # -- what goes wrong ---------------------------------------------------------------------------------------
 
     def _fault(self, text: str) -> None:
-        if text not in self._said:
-            self._said.add(text)
+        if text not in self._faulted:
+            self._faulted.add(text)
             line = f"{text} (vehicle time {self.body.time_us * 1e-6:.3f} s)"
             self.report.fault(line)
             self._say(line)

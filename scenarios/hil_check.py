@@ -40,7 +40,7 @@ class Finding:
     Attributes:
         what: in a few words. ok: it is as it must be.
         seen: what was found. remedy: what to do; empty if it is ok.
-        fatal: nothing flies before it is put right; otherwise `froude fly` does that itself, or it may do no harm.
+        fatal: nothing flies before it is put right. mended: `froude fly` does that by itself.
     """
 
     what: str
@@ -48,6 +48,7 @@ class Finding:
     seen: str
     remedy: str = ""
     fatal: bool = True
+    mended: bool = False
 
     def sentence(self) -> str:
         """For an error's text."""
@@ -202,7 +203,7 @@ def _outputs(values: dict[str, ParamResult], count: int, *, board: bool) -> Find
         else f"Set {prefix}n = {_MOTOR1 - 1} + n while disarmed: {first} = {_MOTOR1 + number - 1}"
     )
     # froude fly sets what differs from a simulator's defaults; what does not exist nobody can set
-    return Finding("outputs", False, seen, remedy, fatal=absent)
+    return Finding("outputs", False, seen, remedy, fatal=absent, mended=not absent)
 
 
 def _calibration(values: dict[str, ParamResult]) -> Finding:
@@ -228,7 +229,7 @@ def _geometry(values: dict[str, ParamResult], model: VehicleModel, *, board: boo
         return Finding("rotor geometry", True, f"is {model.airframe.name}'s")
     shown = "; ".join(wrong[:3]) + (f"; and {len(wrong) - 3} more" if len(wrong) > 3 else "")
     remedy = "Set them while disarmed (froude fly does it by itself, froude hil with --setup)"
-    return Finding("rotor geometry", False, shown, remedy, fatal=False)
+    return Finding("rotor geometry", False, shown, remedy, fatal=False, mended=True)
 
 
 # -- parameters ------------------------------------------------------------------------------------------------

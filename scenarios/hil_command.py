@@ -204,12 +204,18 @@ def findings_text(findings: list[Finding]) -> str:
     """
     lines = []
     for one in findings:
-        mark = "ok   " if one.ok else "WRONG" if one.fatal else "note "
+        mark = "ok   " if one.ok else "WRONG" if one.fatal else "unset" if one.mended else "note "
         lines.append(f"{mark}  {one.what}: {one.seen}")
         if one.remedy:
             lines.append(f"       -> {one.remedy}")
     wrong = sum(1 for one in findings if not one.ok and one.fatal)
-    lines.append("nothing keeps it from flying this plant" if not wrong else f"{wrong} to put right before it flies")
+    unset = sum(1 for one in findings if one.mended and not one.ok)
+    if wrong:
+        lines.append(f"{wrong} to put right before it flies")
+    elif unset:
+        lines.append("froude fly and froude hil --setup put right what is unset; as it is now it cannot fly this plant")
+    else:
+        lines.append("nothing keeps it from flying this plant")
     return "\n".join(lines)
 
 

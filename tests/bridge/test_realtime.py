@@ -212,6 +212,13 @@ def test_numbers_that_are_none_are_a_fault_and_move_nothing() -> None:
     assert rig.real_time.motors[:4] == (0.0,) * 4
     assert "no number" in rig.real_time.report.faults[0]
 
+    rig.real_time.begin()
+    rig.steps(2, motors=0.5)
+    assert rig.real_time.report.valid
+    rig.motors(float("inf"))
+    rig.steps(1)
+    assert "no number" in rig.real_time.report.faults[0]
+
 
 def test_an_unplugged_line_is_told_at_once() -> None:
     rig = Rig()

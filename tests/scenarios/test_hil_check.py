@@ -184,6 +184,7 @@ def test_wrong_output_functions_are_named_and_left_to_fly() -> None:
     assert not outputs.ok
     assert "PWM_MAIN_FUNC5 is 0" in outputs.seen
     assert outputs.remedy.endswith("PWM_MAIN_FUNC5 = 105")
+    assert "cannot fly this plant" in findings_text([outputs])
     must_fly(client, autopilot, model)
 
 
