@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from scenarios.flight import FlightRecord, RunRecord
 from scenarios.limits import METRICS, Metric, Outcome
+from scenarios.run_schema import SCHEMA_VERSION, migrate
 from scenarios.table import own_flight, own_gains_fly
 from sitl.errors import FileError
 
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from scenarios.twin import Twin
     from sitl.vehicle_spec import VehicleModel
 
-SCHEMA_VERSION = 2
 RUN_JSON = "run.json"
 FLIGHT_SUFFIXES = (".rrd", ".partial.rrd", ".parquet", ".tlog", ".partial.tlog", ".params", ".backup.params")
 
@@ -304,10 +304,10 @@ def load_run(path: Path) -> dict[str, Any]:
         path: the run's folder, or its `run.json`.
 
     Returns:
-        The object that `run_object` describes.
+        The object that `run_object` describes; what an older program wrote is brought to its schema.
 
     Raises:
-        FileError: no run there, not JSON, or of a schema version that this program does not know.
+        FileError: no run there, not JSON, or written by a newer program.
     """
     file = path / RUN_JSON if path.is_dir() else path
     try:
@@ -316,14 +316,7 @@ def load_run(path: Path) -> dict[str, Any]:
         raise FileError(file, f"cannot be read: {error.strerror or error}", "Give the folder of a run") from error
     except ValueError as error:
         raise FileError(file, f"is not JSON: {error}", "Give the folder of a run") from error
-    version = run.get("schema_version") if isinstance(run, dict) else None
-    if version != SCHEMA_VERSION:
-        raise FileError(
-            file,
-            f"schema_version is {version!r}, this program reads {SCHEMA_VERSION}",
-            "Use the version of froude that wrote it" if version is not None else "Give the folder of a run",
-        )
-    return dict(run)
+    return migrate(run, file)
 
 
 def write_atomically(path: Path, data: bytes) -> None:

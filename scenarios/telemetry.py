@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -142,14 +142,19 @@ class Telemetry:
         first, last = np.searchsorted(self["t_s"], [start_s - 1e-9, end_s + 1e-9])
         return self.select(slice(int(first), int(last)))
 
-    def sha256(self) -> str:
+    def sha256(self, names: Collection[str] = COLUMNS) -> str:
         """Fingerprint of the flight: SHA-256 of every column's little-endian bytes, in schema order.
+
+        Args:
+            names: columns that count; fewer for what an older program wrote.
 
         Nothing else enters (no file bytes, date or version), so anyone can recompute it from the Parquet
         file. NaNs are counted as the one quiet NaN, because their payload bits differ between processors.
         """
         digest = hashlib.sha256()
         for name, column in COLUMNS.items():
+            if name not in names:
+                continue
             values = self.columns[name]
             if column.dtype.startswith("<f") and np.isnan(values).any():
                 values = np.where(np.isnan(values), np.array(np.nan, dtype=column.dtype), values)
@@ -191,20 +196,47 @@ class Telemetry:
 
     @classmethod
     def from_parquet(cls, path: str | Path) -> tuple[Telemetry, dict[str, Any]]:
-        """Telemetry and metadata written by `to_parquet`.
+        """Telemetry and metadata written by `to_parquet`; columns that an older program did not write are missing.
 
         Raises:
-            FileError: no such file, not Parquet, or not telemetry of this program.
+            FileError: no such file, not Parquet, not telemetry of this program, or of a newer one.
         """
         import pyarrow as pa
         import pyarrow.parquet as pq
 
+        remedy = "Give a flights/*.parquet of a run"
         try:
             table = pq.read_table(path)
-        except (OSError, pa.ArrowInvalid) as error:
-            raise FileError(path, f"cannot be read as Parquet: {error}", "Give a flights/*.parquet of a run") from error
+        except (OSError, ValueError, MemoryError, pa.ArrowException) as error:
+            # Arrow's text may go on for lines, with its own source in it
+            problem = str(error).partition("\n")[0]
+            raise FileError(path, f"cannot be read as Parquet: {problem}", remedy) from error
         raw = (table.schema.metadata or {}).get(METADATA_KEY)
-        if raw is None or set(table.column_names) != set(COLUMNS):
-            raise FileError(path, "is not telemetry of froude", "Give a flights/*.parquet of a run")
-        columns = {name: table[name].to_numpy() for name in COLUMNS}
-        return cls.from_columns(columns), json.loads(raw)
+        if raw is None or "t_s" not in table.column_names:
+            raise FileError(path, "is not telemetry of froude", remedy)
+        unknown = [name for name in table.column_names if name not in COLUMNS]
+        if unknown:
+            problem = f"has the column {unknown[0]!r}, which this froude does not know: a newer one wrote it"
+            raise FileError(path, problem, "Use the version of froude that wrote it, or a newer one")
+        try:
+            about = json.loads(raw)
+            columns = {name: table[name].to_numpy() for name in table.column_names}
+            telemetry = cls.from_columns(columns)
+        except (ValueError, TypeError, pa.ArrowException, UsageError) as error:
+            raise FileError(path, f"is damaged: {error}", remedy) from error
+        return telemetry, dict(about)
+
+
+def column_names(path: str | Path) -> tuple[str, ...]:
+    """Columns that a Parquet file has.
+
+    Raises:
+        FileError: it cannot be read.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        return tuple(pq.read_schema(path).names)
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise FileError(path, f"cannot be read as Parquet: {error}", "Give a flights/*.parquet of a run") from error

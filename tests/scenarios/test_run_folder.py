@@ -9,7 +9,6 @@ import pytest
 
 from scenarios.limits import Outcome, measured
 from scenarios.run_folder import (
-    SCHEMA_VERSION,
     RunFolder,
     load_run,
     plain,
@@ -17,6 +16,7 @@ from scenarios.run_folder import (
     vehicle_description,
     write_atomically,
 )
+from scenarios.run_schema import SCHEMA_VERSION
 from sitl.errors import FileError
 from sitl.vehicle_spec import resolve_vehicle
 
@@ -122,7 +122,7 @@ def test_what_load_run_reads_is_what_was_written(flown_run, tmp_path):
         (None, "cannot be read"),
         ("{", "is not JSON"),
         ("[]", "schema_version is None"),
-        ('{"schema_version": 99}', "schema_version is 99, this program reads 2"),
+        ('{"schema_version": 99}', "schema_version is 99, this program reads 1 to 2: written by a newer froude"),
     ],
 )
 def test_a_run_that_cannot_be_read_is_named(tmp_path, text, complaint):
