@@ -141,6 +141,7 @@ class ArduPilotFace:
         self._count: int | None = None
         self._line = b""
         self._lost = False
+        self._before_s = 0.0
         body.reset()
 
     def answer(self, frame: ServoFrame) -> bytes:
@@ -167,7 +168,7 @@ class ArduPilotFace:
         self.armed = any(motors)
         self.body.step(motors)
         self.report.frames += 1
-        self.report.served_s += 1.0 / frame.rate_hz
+        self.report.served_s = self._before_s + self.body.time_s
         if self.body.plant.lost and not self._lost:
             self._lost = True
             self._fault("the motion diverged out of all sense; it lies upside down until ArduPilot restarts")
@@ -185,6 +186,7 @@ class ArduPilotFace:
         self._say(f"ArduPilot started anew ({why}): back on the ground")
         self.report.restarts += 1
         self._count, self._lost, self.armed = None, False, False
+        self._before_s = self.report.served_s
         self.body.reset()
 
     def _begin(self, frame: ServoFrame) -> None:

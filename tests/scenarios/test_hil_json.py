@@ -277,12 +277,27 @@ def test_what_is_no_ardupilot_is_not_answered_and_takes_nobodys_place() -> None:
 
 def test_it_stops_by_itself_after_the_seconds_asked_for() -> None:
     def run(port: int) -> None:
-        copter = StandIn(port)
-        for _ in range(100):
+        copter = StandIn(port, rate_hz=1200)
+        for _ in range(720):
             copter.step(IDLE)
+        with pytest.raises(AssertionError, match="does not answer"):
+            copter.ask(IDLE, tries=2)
         copter.close()
 
-    assert Served(run, seconds=0.25).report["vehicle_time_s"] == pytest.approx(0.25)
+    report = Served(run, seconds=0.6).report
+    assert (report["frames"], report["vehicle_time_s"]) == (720, pytest.approx(0.6))
+
+
+def test_vehicle_time_adds_up_over_restarts() -> None:
+    def run(port: int) -> None:
+        copter = StandIn(port)
+        for count in (0, 1, 2, 0, 1):
+            copter.count = count
+            copter.ask(IDLE)
+        copter.close()
+
+    report = Served(run).report
+    assert (report["frames"], report["restarts"], report["vehicle_time_s"]) == (5, 1, pytest.approx(5 / 400))
 
 
 # -- the command -----------------------------------------------------------------------------------------------
