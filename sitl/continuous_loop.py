@@ -21,6 +21,9 @@ from sitl.sampled_loop import RollGains
 OMEGA_MAX_RAD_S = 1e5
 """Far above anything that moves."""
 
+MARGINAL_1_S = 1e-7
+"""A mode that decays slower than this counts as one that never does, see `sitl.margin_batch.MARGINAL`."""
+
 
 class ContinuousLoop:
     """The continuous loop of one gain set on S samples; a `sitl.crossings.Loop`.
@@ -108,7 +111,7 @@ class ContinuousLoop:
     def unstable(self, rows: IndexArray, gains: FloatArray) -> IndexArray:
         """See `sitl.crossings.Loop`."""
         values = np.linalg.eigvals(self.closed_loop_matrix(gains, rows))
-        return np.asarray(np.count_nonzero(values.real >= 0.0, axis=-1))
+        return np.asarray(np.count_nonzero(values.real >= -MARGINAL_1_S, axis=-1))
 
 
 def continuous_margins(derivatives: FloatArray, gains: Sequence[RollGains], motor_lag_s: float = 0.0) -> MarginArrays:

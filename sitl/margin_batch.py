@@ -24,6 +24,10 @@ from sitl.sampled_loop import ComplexArray, FloatArray, RollGains, SampledLoop
 # Lowest frequency looked at: below the slowest integrator crossover of any gain worth flying.
 OMEGA_MIN_RAD_S = 1e-4
 
+MARGINAL = 1e-9
+"""An eigenvalue this close to the unit circle counts as outside: a mode that never dies away, as without K_phi, lies
+on it, and rounding would put it on this side for one sample and on that for the next."""
+
 
 @dataclass(frozen=True)
 class MarginArrays:
@@ -81,7 +85,7 @@ class Sampled:
     def unstable(self, rows: IndexArray, gains: FloatArray) -> IndexArray:
         """See `Loop`."""
         values = np.abs(self.loop.sample(rows).eigenvalues(gains))
-        return np.asarray(np.count_nonzero(values >= 1.0, axis=-1))
+        return np.asarray(np.count_nonzero(values >= 1.0 - MARGINAL, axis=-1))
 
 
 def batch_margins(

@@ -12,7 +12,7 @@ from scenarios.study.figure_style import COLOURS, LIMIT, MARKERS, TRUE, finished
 from scenarios.study.model_figures import OMEGA, responses
 from scenarios.study.printed import AIRFRAMES
 from scenarios.study.result import Figure, FloatArray
-from sitl.airframe import Derivatives, load_airframe
+from sitl.airframe import load_airframe
 from sitl.lateral import G_M_S2
 from sitl.vehicle_spec import VehicleModel, resolve_vehicle
 
@@ -119,7 +119,10 @@ def _bands(target: str, samples: int, seed: int) -> Figure:
 
 def _many(derivatives: FloatArray) -> np.ndarray:
     """(S, F) p / delta_lat of samples."""
-    return np.stack([responses(Derivatives.from_values(row), OMEGA)[0] for row in derivatives])
+    a, b = np.zeros((len(derivatives), 3, 3)), np.zeros((len(derivatives), 3, 1))
+    a[:, 0, :2], a[:, 0, 2], a[:, 1, :2], a[:, 2, 1] = derivatives[:, :2], G_M_S2, derivatives[:, 3:5], 1.0
+    b[:, 0, 0], b[:, 1, 0] = derivatives[:, 2], derivatives[:, 5]
+    return np.stack([np.linalg.solve(1j * omega * np.eye(3) - a, b)[:, 1, 0] for omega in OMEGA], axis=-1)
 
 
 def _gain_and_phase(value: np.ndarray) -> tuple[FloatArray, FloatArray]:

@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from scenarios.study.own_statements import judged, own_statements
 from scenarios.study.printed import AIRFRAMES, printed
 from scenarios.study.result import Conclusion, FloatArray, Pair, Verdict
-from scenarios.study.summary import line_of
-from scenarios.tuning.requirements import requirements_for
 from sitl.airframe import Derivatives, load_airframe
 from sitl.froude import froude_number, scale_derivatives, scale_gain, scale_sigma
 from sitl.lateral import LateralModel
@@ -56,8 +55,7 @@ def conclusions(pairs: Sequence[Pair]) -> tuple[Conclusion, ...]:
         *_chapter_7(own),
         *_groups(),
         _authority(),
-        *_reality(pairs),
-        *_tuned(pairs),
+        *own_statements(pairs),
     )
 
 
@@ -88,10 +86,6 @@ def _models() -> dict[str, Derivatives]:
     return {name: load_airframe(name).derivatives for name in AIRFRAMES}
 
 
-def _said(condition: bool) -> Verdict:
-    return Verdict.CONFIRMED if condition else Verdict.REFUTED
-
-
 def _modes() -> Conclusion:
     shapes = []
     for name, d in _models().items():
@@ -102,7 +96,7 @@ def _modes() -> Conclusion:
     return Conclusion(
         "3",
         "Every airframe has one stable real mode and one unstable oscillation.",
-        _said(all(ok for _, ok in shapes)),
+        judged(all(ok for _, ok in shapes)),
         f"{sum(ok for _, ok in shapes)} of {len(shapes)} by the eigenvalues of table 2.1.",
     )
 
@@ -118,7 +112,7 @@ def _rays() -> Conclusion:
     return Conclusion(
         "4",
         "Scaled eigenvalues move along rays by sqrt(N) and never cross the imaginary axis.",
-        _said(worst < 1e-6 and crossed == 0),
+        judged(worst < 1e-6 and crossed == 0),
         f"N from 0.25 to 4: largest relative deviation {worst:.1e}, {crossed} crossings.",
     )
 
@@ -138,7 +132,7 @@ def _predicts() -> Conclusion:
     return Conclusion(
         "5",
         "Froude scaling does not predict these airframes from one another.",
-        _said(len(good) <= len(errors) // 4),
+        judged(len(good) <= len(errors) // 4),
         f"|p/delta| is within {PREDICTS_DB:g} dB of the truth from 1 to 50 rad/s for {len(good)} of {len(errors)} pairs"
         f"{' (' + ', '.join(good) + ')' if good else ''}; best {best} {errors[best]:.1f} dB, worst {worst} "
         f"{errors[worst]:.1f} dB.",
@@ -153,7 +147,7 @@ def _same_size() -> Conclusion:
     return Conclusion(
         "5",
         "ADAM-0 and CARRIER-1 share a diagonal, so N = 1, and yet differ.",
-        _said(N == 1.0 and apart > 0.1),
+        judged(N == 1.0 and apart > 0.1),
         f"N = {N:g}; eigenvalues up to {apart:.2f} 1/s apart, |p/delta| up to {gap:.1f} dB.",
     )
 
@@ -193,7 +187,7 @@ def _gain() -> Conclusion:
     return Conclusion(
         "6.6",
         "Multiplying the model's gain by sqrt(N) leaves the eigenvalues where they are.",
-        _said(worst < 1e-9 and gap < 1e-9),
+        judged(worst < 1e-9 and gap < 1e-9),
         f"Eigenvalues move by at most {worst:.0e}, magnitudes by 10 log10 N to within {gap:.0e} dB.",
     )
 
@@ -247,9 +241,9 @@ def _chapter_7(pairs: Sequence[Pair]) -> list[Conclusion]:
             Conclusion(
                 section,
                 statement,
-                _said(holds == count),
+                judged(holds == count),
                 f"{holds} of {count} pairs on all {samples} models{'; not ' + exceptions if exceptions else ''}. "
-                f"Over all: {edge:.3g} {unit}.",
+                f"Over all: {edge:.4g} {unit}." + (_at_the_limit(settling, limit) if values is settling else ""),
             )
         )
     made.append(_sampled_margin(pairs))
@@ -257,12 +251,18 @@ def _chapter_7(pairs: Sequence[Pair]) -> list[Conclusion]:
     return made
 
 
+def _at_the_limit(settling: Sequence[tuple[Pair, FloatArray]], limit: float) -> str:
+    """Pairs whose slowest sample is within a hundredth of the limit: another draw may have one beyond it."""
+    close = [f"{p.target} on {p.based_on}" for p, v in settling if 0.99 * limit < np.nan_to_num(v).max() <= limit]
+    return f" At the limit, so that another draw may be beyond it: {', '.join(close)}." if close else ""
+
+
 def _sampled_margin(pairs: Sequence[Pair]) -> Conclusion:
     high = np.concatenate([p.margins["sampled_gain_margin_high_db"] for p in pairs])
     return Conclusion(
         "ours",
         "The infinite gain margin carries over to a loop that is sampled.",
-        _said(bool(np.isposinf(high).all())),
+        judged(bool(np.isposinf(high).all())),
         f"At 1 kHz, without filter, lag or delay, the upper gain margin is {np.nanmin(high):.1f} to "
         f"{np.nanmax(high):.1f} dB: sampling alone bounds it.",
     )
@@ -277,13 +277,15 @@ def _overshoot(pairs: Sequence[Pair], said: dict[str, object]) -> Conclusion:
     if not mine or np.isnan(mine[0]).all():
         return Conclusion("7", statement, Verdict.UNDECIDED, "Not flown.")
     most, nominal = float(np.nanmax(mine[0])), float(mine[0][0])
+    (trace,) = (p.step_phi_rad[0] for p in pairs if (p.target, p.based_on) == (target, based_on))
+    beyond_end = 100.0 * (float(trace.max()) / float(trace[-1]) - 1.0)
     holds = most > pct if above else abs(most - pct) <= _NEAR_OVERSHOOT * pct
     return Conclusion(
         "7",
         statement,
-        _said(holds),
+        judged(holds),
         f"With the printed gains on the printed model: nominal {nominal:.2f} %, most of any sample {most:.2f} %, in a "
-        "hold of 5 s.",
+        f"hold of 5 s; of the angle at its end instead of the set-point, nominal {beyond_end:.2f} %.",
     )
 
 
@@ -298,7 +300,7 @@ def _groups() -> list[Conclusion]:
             Conclusion(
                 "8",
                 f"{one} and {other} form a group: near-equal eigenvalues, magnitudes apart.",
-                _said(apart <= NEAR_EIGENVALUES and float(np.abs(ratio).min()) > PREDICTS_DB),
+                judged(apart <= NEAR_EIGENVALUES and float(np.abs(ratio).min()) > PREDICTS_DB),
                 f"Eigenvalues at most {100 * apart:.0f} % apart (near: {100 * NEAR_EIGENVALUES:.0f} %); |p/delta| of "
                 f"{one} is {ratio.min():.1f} to {ratio.max():.1f} dB above that of {other} from 1 to 50 rad/s.",
             )
@@ -316,57 +318,3 @@ def _authority() -> Conclusion:
         "None of the airframes is a plus. By geometry alone, every motor at its limit, a cross of that diagonal has "
         f"{more:.0f} % more; what the air leaves of it no number here can say.",
     )
-
-
-def _reality(pairs: Sequence[Pair]) -> list[Conclusion]:
-    """Ours: do the study's gains fly where the loop is not ideal?"""
-    real = [p for p in pairs if p.profile != "study" and p.source.startswith("table")]
-    if not real:
-        return []
-    names = sorted({p.profile for p in real})
-    quiet = [p for p in real if float(np.nanmean(np.nan_to_num(p.metrics["oscillation_rad_s"], nan=9.9) <= 0.3)) == 1.0]
-    text = ", ".join(f"{p.target} on {p.based_on}" for p in quiet)
-    return [
-        Conclusion(
-            "ours",
-            "The study's gains fly on an autopilot with filters, ticks and motor lag.",
-            _said(len(quiet) == len(real)),
-            f"Profile {', '.join(names)}, motor lag as assumed: {len(quiet)} of {len(real)} pairs are free of limit "
-            f"cycles on every sample{' (' + text + ')' if text else ''}.",
-        )
-    ]
-
-
-def _tuned(pairs: Sequence[Pair]) -> list[Conclusion]:
-    """Ours: what gains tuned here meet on the true models, and by how much they miss it where they do not."""
-    made = []
-    for profile in dict.fromkeys(p.profile for p in pairs if p.source.startswith("tuned")):
-        required = requirements_for(profile)
-        for itself in (True, False):
-            mine = [
-                p
-                for p in pairs
-                if p.source.startswith("tuned") and p.profile == profile and (p.target == p.based_on) is itself
-            ]
-            lines = [(p, line_of(p)) for p in mine]
-            bad = [(p, n) for p, n in lines if n.meets < 1.0]
-            told = "; ".join(
-                f"{p.target} on {p.based_on}: {100 * n.meets:.1f} % of the samples, settling "
-                + ("not on all" if math.isnan(n.settling_s[1]) else f"{n.settling_s[1]:.2f} s")
-                + f", overshoot {n.overshoot_pct:.2f} %, delay margin {1e3 * n.delay_margin_s:.1f} ms"
-                for p, n in bad
-            )
-            on = "each airframe's own model" if itself else "the scaled models of the other airframes"
-            bounds = f"settling {required.settling_time_s:g} s, overshoot {required.overshoot_pct:g} %"
-            if required.delay_margin_s:
-                bounds += f", delay margin {1e3 * required.delay_margin_s:g} ms"
-            made.append(
-                Conclusion(
-                    "ours",
-                    f"Gains tuned here for profile {profile} on {on} meet {bounds} on every sample of the true one.",
-                    _said(not bad),
-                    f"{len(lines) - len(bad)} of {len(lines)} pairs on all samples."
-                    + (f" Not: {told}." if told else ""),
-                )
-            )
-    return made

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 from scenarios.run_folder import write_atomically
@@ -19,12 +21,30 @@ def draw_all(
     Args:
         pairs: of chapter 7. samples, seed: of the clouds of chapter 6. progress: called with a short text.
     """
+    kinds: dict[tuple[str, str], list[Pair]] = {}
+    for pair in pairs:
+        kinds.setdefault((pair.source.partition(" ")[0], pair.profile), []).append(pair)
     drawn: list[Figure] = []
-    for some in (model_figures.draw(), cloud_figures.draw(samples, seed), pair_figures.draw(pairs)):
-        for figure in some:
-            drawn.append(figure)
-            progress(f"figure {len(drawn)}: {figure.title}")
+    # two processes: drawing is one thread, and most of what a study takes
+    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+        jobs = [pool.submit(_models), pool.submit(_clouds, samples, seed)]
+        jobs += [pool.submit(_pairs, some) for some in kinds.values()]
+        for job in jobs:
+            drawn += job.result()
+            progress(f"{len(drawn)} figures drawn")
     return tuple(sorted(drawn, key=lambda figure: [int(part) for part in figure.section.split(".")]))
+
+
+def _models() -> list[Figure]:
+    return list(model_figures.draw())
+
+
+def _clouds(samples: int, seed: int) -> list[Figure]:
+    return list(cloud_figures.draw(samples, seed))
+
+
+def _pairs(pairs: Sequence[Pair]) -> list[Figure]:
+    return list(pair_figures.draw(pairs))
 
 
 def write_figures(figures: Sequence[Figure], folder: Path) -> None:

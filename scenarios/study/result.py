@@ -157,6 +157,10 @@ class Pair:
     track_delta_lat: FloatArray
 
 
+PRINTED_FIGURES = ("6.13", "8.2", "8.4")
+"""Figures of ours that stand for one that the study numbers; the others stand for a chapter or section."""
+
+
 @dataclass(frozen=True)
 class Figure:
     """One drawn figure.
@@ -165,7 +169,7 @@ class Figure:
         name: file stem, such as "fig_6_13_ant-x".
         title: one line.
         caption: what it shows and how it was computed; also its text alternative.
-        section: chapter or section of the study that it stands for.
+        section: chapter, section or figure (PRINTED_FIGURES) of the study that it stands for.
         svg: the drawing, self-contained.
         png: the same as pixels.
     """
@@ -176,6 +180,12 @@ class Figure:
     section: str
     svg: str
     png: bytes
+
+    @property
+    def place(self) -> str:
+        """Where in the study it belongs, in words."""
+        kind = "figure" if self.section in PRINTED_FIGURES else "section" if "." in self.section else "chapter"
+        return f"{kind} {self.section}"
 
 
 @dataclass(frozen=True)

@@ -163,7 +163,7 @@ def holds_an_angle(derivatives: FloatArray) -> BoolArray:
 
     phi / delta_lat has a zero at (Lv Yd - Ld Yv) / -Ld. Where it lies in the right half plane the torque that holds an
     angle points the other way than the torque that reaches it: an integrator then drives the loop away, whatever its
-    gain. No gains of the fixed structure stabilise such a model.
+    gain. Without one the loop may be stable, but comes to rest rolled to the other side.
 
     Args:
         derivatives: (S, 6).

@@ -178,6 +178,42 @@ class TestConclusions:
         assert Verdict.REFUTED in told
 
 
+class TestOwnStatements:
+    def test_which_models_no_gains_can_hold(self, study: Study) -> None:
+        """By the corners of the box for whether, by draws of another generator for how many."""
+        (one,) = [c for c in study.conclusions if "can be held at a roll angle" in c.statement]
+        assert one.verdict is Verdict.REFUTED
+        rng = np.random.default_rng(99)
+        for name in FRAMES:
+            said = ORACLE["derivatives"][name]
+            centre = np.array([said["value"][d] for d in ("Yv", "Yd", "Lv", "Ld")])
+            sigma = np.abs(centre) * [said["sigma_pct"][d] / 100.0 for d in ("Yv", "Yd", "Lv", "Ld")]
+            Yv, Yd, Lv, Ld = (centre + sigma * rng.uniform(-3.0, 3.0, (200_000, 4))).T
+            share = 100.0 * float(np.mean(Lv * Yd <= Ld * Yv))
+            told = re.search(rf"{name} \([\d.e-]+ % of gaussian draws, ([\d.]+) % of uniform draws\)", one.evidence)
+            assert (share > 0.0) == (told is not None)
+            if told is not None:
+                assert float(told[1]) == pytest.approx(share, rel=0.1)
+
+    def test_a_settling_time_at_the_limit_is_said_to_be(self, study: Study) -> None:
+        (one,) = [c for c in study.conclusions if c.statement.startswith("Every controller settles within")]
+        slowest = {
+            (p.target, p.based_on): float(np.nanmax(p.metrics["settling_time_5pct_s"]))
+            for p in study.pairs
+            if p.profile == "study"
+        }
+        close = {pair for pair, value in slowest.items() if 0.495 < value <= 0.5}
+        assert close
+        for target, based_on in close:
+            assert f"{target} on {based_on}" in one.evidence.partition("At the limit")[2]
+
+    def test_overshoot_is_no_matter_of_what_it_is_measured_against(self, study: Study) -> None:
+        told = [c for c in study.conclusions if "overshoots by" in c.statement]
+        assert len(told) == 4
+        for one in told:
+            assert "of the angle at its end instead of the set-point, nominal 0.00 %" in one.evidence
+
+
 class TestPairs:
     def test_sixteen_in_each_profile(self, study: Study) -> None:
         for profile in ("study", "sitl"):
@@ -294,6 +330,13 @@ class TestShown:
         names = [figure.name for figure in figures]
         assert len(names) == len(set(names))
         assert len(names) >= 29
+
+    def test_figures_of_the_print_are_not_called_sections(self, figures: tuple[Figure, ...]) -> None:
+        places = {figure.place for figure in figures}
+        assert places == {
+            "chapter 4", "chapter 5", "section 6.3", "section 6.4", "section 6.5", "figure 6.13", "chapter 7",
+            "figure 8.2", "figure 8.4",
+        }  # fmt: skip
 
     def test_every_figure_is_a_picture(self, figures: tuple[Figure, ...]) -> None:
         for figure in figures:

@@ -115,7 +115,7 @@ def test_the_upper_limit_of_the_bare_sampled_loop_lies_at_half_the_rate() -> Non
     st.sampled_from(PROFILES),
     st.sampled_from([0.0, 0.03]),
 )
-@settings(max_examples=60)
+@settings(deadline=None, max_examples=60)
 def test_any_model_and_gains_give_numbers_that_hold_together(
     spread: list[float], k_phi: float, kp: float, ki: float, kd: float, profile: Profile, lag: float
 ) -> None:
@@ -198,6 +198,26 @@ class TestContinuous:
         values = np.linalg.eigvals(opened[0])
         for pole in np.linalg.eigvals(LateralModel.from_derivatives(model).A):
             assert np.abs(values - pole).min() < 1e-9
+
+
+class TestMarginal:
+    """Without K_phi the integral of p stands for phi: one mode lies on the boundary, whatever the model."""
+
+    @pytest.mark.parametrize("profile", ["study", "sitl", "board"])
+    def test_no_attitude_gain_is_no_stability_whatever_the_rounding(self, profile: str) -> None:
+        still = RollGains(0.0, 1.0, 0.05, 0.05, 0.001)
+        d = samples("ant-x", 200)
+        found = batch_margins(d, [still], get_profile(profile), 0.0 if profile == "study" else 0.025)
+        assert not found.closed_loop_stable.any()
+
+    def test_the_continuous_loop_alike(self) -> None:
+        still = RollGains(0.0, 1.0, 0.05, 0.05, 0.001)
+        assert not continuous_margins(samples("ant-x", 200), [still]).closed_loop_stable.any()
+
+    def test_a_slow_mode_that_dies_is_stable(self) -> None:
+        """v' = -1e-4 v decays in hours, and feels nothing of the loop's."""
+        d = np.array([[-1e-4, 0.0, 0.0, 0.0, -2.0, 400.0]])
+        assert batch_margins(d, [FLOWN], get_profile("study"), 0.0).closed_loop_stable.all()
 
 
 class TestBadInput:
