@@ -96,7 +96,7 @@ class TestWeights:
         assert 1.0 / weights_for(STUDY)[1].b == pytest.approx(1e3)
 
     @given(st.floats(0.06, 3.0), st.floats(1.05, 3.0))
-    @settings(max_examples=40)
+    @settings(deadline=None, max_examples=40)
     def test_a_first_order_loop_that_just_settles_keeps_w1_and_half_as_fast_breaks_it(
         self, settling: float, peak: float
     ) -> None:
@@ -116,7 +116,7 @@ class TestWeights:
         assert fast.b == pytest.approx(2.0 * slow.b)
 
     @given(st.floats(0.05, 0.7), st.floats(0.0, 60.0))
-    @settings(max_examples=40)
+    @settings(deadline=None, max_examples=40)
     def test_w3_allows_the_peak_of_the_damping_or_the_overshoot_and_no_more(self, zeta: float, over: float) -> None:
         required = replace(PRACTICAL, damping=zeta, overshoot_pct=over)
         third = weights_for(required)[2]

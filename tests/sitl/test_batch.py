@@ -148,6 +148,7 @@ class TestAgainstMathematics:
         angles = np.linspace(-1.75, 1.75, 401)
         assert array_form(sine)(angles) == pytest.approx(np.sin(angles), abs=1e-13)
 
+    @settings(deadline=None)
     @given(st.floats(-1.5, 1.5), st.floats(-0.8, 0.8), st.floats(0.1, 15.0), st.floats(0.5, 5.0))
     def test_the_attitude_law_of_a_roll_is_that_of_three_axes(
         self, phi: float, phi_sp: float, k_phi: float, rate_max: float
@@ -160,7 +161,7 @@ class TestAgainstMathematics:
 
 
 class TestWaysOfRunning:
-    @settings(max_examples=15)
+    @settings(deadline=None, max_examples=15)
     @given(
         st.sampled_from(["study", "sitl", "board"]),
         st.sampled_from(["ant-x", "ant-r", "carrier-1", "adam-0"]),
@@ -210,6 +211,7 @@ class TestWaysOfRunning:
         flown(job("ant-x", get_profile("sitl"), FLOWN, np.full(10, 0.1)), True)
         assert is_compiled(fly_lanes)
 
+    @settings(deadline=None)
     @given(st.floats(-10, 10), st.floats(-10, 10), st.floats(-500, 500), st.floats(-0.3, 0.3), st.booleans())
     def test_the_rate_law_on_an_array_is_the_rate_law(
         self, rate: float, rate_sp: float, accel: float, integral: float, up: bool

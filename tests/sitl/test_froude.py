@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sitl.airframe import Derivatives, load_airframe
@@ -84,6 +84,7 @@ def test_scaling_replays_the_same_motion_sqrt_n_times_faster(name: str, N: float
         assert response(after, omega * np.sqrt(N)) == pytest.approx(expected, rel=1e-9)
 
 
+@settings(deadline=None)
 @given(st.floats(0.05, 20.0), st.floats(0.05, 20.0))
 def test_scaling_twice_is_scaling_once_by_the_product(first: float, second: float) -> None:
     derivatives = Derivatives(-0.2, 0.1, 10.0, -6.0, -2.0, 450.0)

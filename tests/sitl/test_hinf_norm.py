@@ -74,7 +74,7 @@ def test_a_mere_gain() -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 9), st.integers(1, 3), st.integers(1, 3), st.booleans())
-@settings(max_examples=150)
+@settings(deadline=None, max_examples=150)
 def test_never_below_a_dense_grid_and_hardly_above(seed: int, n: int, inputs: int, outputs: int, sampled: bool) -> None:
     rng = np.random.default_rng(seed)
     a = rng.standard_normal((n, n))

@@ -78,7 +78,7 @@ def test_no_sigma_means_the_nominal_model_every_time() -> None:
     assert Derivatives.from_values(samples[0]) == NOMINAL
 
 
-@settings(max_examples=25)
+@settings(deadline=None, max_examples=25)
 @given(st.integers(1, 200), st.floats(0.5, 8.0), st.integers(0, 2**32))
 def test_any_request_is_filled_within_its_bounds(n: int, spread: float, seed: int) -> None:
     samples = sample_derivatives(NOMINAL, SIGMA, n, np.random.default_rng(seed), spread)
