@@ -20,6 +20,16 @@ LAST_WORDS_S = 0.1
 ARRIVAL_S = 0.003
 """Wall-clock time that a set-point is given to get through the autopilot's own threads before the next tick."""
 
+BEHIND_US = 40_000
+"""Vehicle time by which the autopilot's telemetry may be behind the plant: it comes from a thread that nobody in the
+lockstep waits for, and on a busy computer it would leave gaps."""
+
+BEHIND_WAIT_S = 0.05
+"""Wall-clock time that late telemetry is waited for."""
+
+BEHIND_REST_US = 1_000_000
+"""Vehicle time without such waits after one was in vain: nothing is being streamed."""
+
 
 class HilDrive(Drive):
     """Waits by stepping the plant.
@@ -44,10 +54,16 @@ class HilDrive(Drive):
         self._left = False
         self._quat: tuple[float, float, float, float] | None = None
         self._hold = False
+        self._heard_us: int | None = None
+        self._follow_from_us = 0
 
     def now_us(self) -> int:
         """Vehicle time: the plant's, which is the autopilot's, too; us."""
         return self.lockstep.body.time_us
+
+    def heard(self, time_us: int) -> None:
+        """A message of the autopilot carried this vehicle time."""
+        self._heard_us = time_us
 
     def sent_setpoint(self, quat: tuple[float, float, float, float]) -> None:
         """A changed set-point must be there before time goes on, or it counts a tick or two later."""
@@ -65,9 +81,19 @@ class HilDrive(Drive):
             self._clock.sleep_until_us(self._clock.now_us() + round(ARRIVAL_S * 1e6))
         while True:
             self._tick()
-            data = link.recv()
+            data = link.recv() or self._late(link)
             if data is not None or self.now_us() >= until_us:
                 return data
+
+    def _late(self, link: Link) -> bytes | None:
+        """Telemetry that is behind the plant, waited for."""
+        now_us = self.now_us()
+        if self._heard_us is None or now_us - self._heard_us < BEHIND_US or now_us < self._follow_from_us:
+            return None
+        data = link.recv(BEHIND_WAIT_S)
+        if data is None:
+            self._follow_from_us = now_us + BEHIND_REST_US
+        return data
 
     def _tick(self) -> None:
         lockstep = self.lockstep

@@ -76,6 +76,7 @@ class FlightRecord:
         telemetry_sha256: `telemetry.sha256()`.
         seed: of this flight's sensors and link.
         parameters: everything that was uploaded, the other axes' gains too.
+        timing: how a real autopilot and our plant kept time, in a line; empty where none flew it.
     """
 
     gain_set: GainSet
@@ -91,6 +92,7 @@ class FlightRecord:
     telemetry_sha256: str
     seed: int
     parameters: Mapping[str, float | int] = field(default_factory=dict)
+    timing: str = ""
 
     def metric(self, name: str, segment: str = "") -> Metric | None:
         """The flight's metric of that name, or one segment's; None if it was not asked for."""

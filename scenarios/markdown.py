@@ -102,6 +102,8 @@ def flight_page(flight: FlightRecord) -> str:
     parts += ["## Gains", gains_table([flight])]
     if flight.warnings:
         parts += ["## Warnings", _bullets(flight.warnings)]
+    if flight.timing:
+        parts += ["## Timing", flight.timing]
     return "\n\n".join(parts) + "\n"
 
 

@@ -325,8 +325,9 @@ class _Flight:
         if stopped is not None and not log.failure:
             outcome = Outcome.UNSET
         notes = [*self._notes, *log.notes]
+        timing = ""
         if self._session is not None:
-            notes.append(self._session.summary())
+            timing = self._session.summary()
             if self._session.faults:
                 outcome, reason = Outcome.UNSET, "invalid: " + "; ".join(self._session.faults)
         record = FlightRecord(
@@ -343,6 +344,7 @@ class _Flight:
             telemetry_sha256=telemetry.sha256(),
             seed=job.scenario.seed,
             parameters={name: value for name, (value, _) in job.parameters.items()},
+            timing=timing,
         )
         with self._stack:
             if self._files is not None:

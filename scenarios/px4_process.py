@@ -16,6 +16,9 @@ from bridge.errors import PeerLost
 from sitl.errors import FileError, UsageError
 
 SIMULATOR_PORT, MAVLINK_PORT = 4560, 14540
+PX4_PORTS = (14580, 18570)
+"""Which a PX4 itself binds, for programs and for ground stations."""
+
 MODEL = "none_iris"
 """PX4's airframe 10016 with a simulator that connects over TCP."""
 
@@ -137,7 +140,11 @@ def free_instance() -> int:
         UsageError: all are taken.
     """
     for instance in range(MOST_INSTANCES):
-        if _free(socket.SOCK_STREAM, SIMULATOR_PORT + instance) and _free(socket.SOCK_DGRAM, MAVLINK_PORT + instance):
+        # its own ports, too: another PX4 of that number, with another simulator, would talk into our link
+        ports = (MAVLINK_PORT, *PX4_PORTS)
+        if _free(socket.SOCK_STREAM, SIMULATOR_PORT + instance) and all(
+            _free(socket.SOCK_DGRAM, port + instance) for port in ports
+        ):
             return instance
     last = MOST_INSTANCES - 1
     raise UsageError(

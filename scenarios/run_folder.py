@@ -227,6 +227,7 @@ def _flight_object(flight: FlightRecord, folder: RunFolder | None, suffix: str =
         "outcome": flight.outcome.value,
         "reason": flight.reason,
         "warnings": list(flight.warnings),
+        "timing": flight.timing,
         "uploaded": plain(flight.parameters),
         "metrics": [_metric_object(metric) for metric in flight.metrics],
         "margins": plain(flight.margins),

@@ -105,9 +105,10 @@ def cells(flight: FlightRecord) -> list[tuple[str, Outcome]]:
 
 
 def notes(flight: FlightRecord) -> list[str]:
-    """Why it did not pass, and the warnings it was flown with."""
+    """Why it did not pass, the warnings it was flown with, and how a real autopilot kept time."""
     lines = [flight.reason] if flight.reason else []
-    return lines + [f"warning: {warning}" for warning in flight.warnings]
+    lines += [f"warning: {warning}" for warning in flight.warnings]
+    return lines + ([flight.timing] if flight.timing else [])
 
 
 def blank_cells(flights: Sequence[FlightRecord]) -> list[str]:
