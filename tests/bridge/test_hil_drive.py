@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from px4_stand_in import StandIn
 
 from bridge.errors import PeerLost, PeerSilent
-from bridge.hil_drive import HilDrive
+from bridge.hil_drive import BEHIND_REST_US, BEHIND_US, HilDrive
 from bridge.link import MemoryLink
 from bridge.lockstep import Lockstep
 from bridge.simulator import Simulator
@@ -130,3 +130,41 @@ def test_a_changed_set_point_is_there_before_the_next_tick(port: TcpLink) -> Non
             one.sent_setpoint(quat)
             one.wait(near, 0)
     assert [(at - START_US) // 4000 - 200 for at in slept] == [0, 2, 4]
+
+
+class SlowLink(MemoryLink):
+    """Telemetry that comes only to who waits for it, as from a thread that has not run yet."""
+
+    def __init__(self, pieces: int) -> None:
+        super().__init__("memory://slow", 10)
+        self.pieces = pieces
+        self.waited: list[float] = []
+
+    def recv(self, timeout_s: float = 0.0) -> bytes | None:
+        if timeout_s == 0.0:
+            return None
+        self.waited.append(timeout_s)
+        self.pieces -= 1
+        return b"news" if self.pieces >= 0 else None
+
+
+def test_telemetry_that_is_behind_the_plant_is_waited_for(port: TcpLink) -> None:
+    slow, one = SlowLink(pieces=2), drive(port)
+    with StandIn(port.port):
+        one.wait(slow, START_US + 400_000)  # nothing was heard yet: nothing is late
+        assert slow.waited == []
+        one.heard(one.now_us())
+        assert one.wait(slow, START_US + 10_000_000) == b"news"
+        assert one.now_us() == START_US + 400_000 + BEHIND_US
+        one.heard(one.now_us() - 20_000)
+        assert one.wait(slow, START_US + 10_000_000) == b"news"
+        assert one.now_us() == START_US + 400_000 + 2 * BEHIND_US - 20_000
+
+
+def test_a_stream_that_has_ended_does_not_hold_the_plant_up(port: TcpLink) -> None:
+    slow, one = SlowLink(pieces=0), drive(port)
+    with StandIn(port.port):
+        one.wait(slow, START_US + 400_000)
+        one.heard(one.now_us())
+        assert one.wait(slow, one.now_us() + 4 * BEHIND_REST_US) is None
+    assert len(slow.waited) == 4
