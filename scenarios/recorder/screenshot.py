@@ -7,14 +7,12 @@ takes every core.
 
 from __future__ import annotations
 
-import shutil
-import socket
-import sys
 import threading
 from pathlib import Path
 from typing import Any
 
 from scenarios.recorder.stream import TIMELINE
+from scenarios.recorder.viewer import headless
 from sitl.errors import FileError, UsageError
 
 _PAUSE_S = 0.3
@@ -40,14 +38,10 @@ def screenshot(rrd: Path, png: Path, at_s: float | None = None, tab: str | None 
         FileError: no such recording, or the picture cannot be written.
         UsageError: no such tab; or the viewer does not start, most likely for want of a Vulkan driver.
     """
-    from rerun.experimental import ViewerClient
-
     if not rrd.is_file():
         raise FileError(rrd, "no such recording", "Give a .rrd file of a run")
     try:
-        with ViewerClient.spawn(
-            headless=True, port=_free_port(), hide_welcome_screen=True, executable_path=_viewer()
-        ) as viewer:
+        with headless() as viewer:
             viewer.open(str(rrd.resolve()))
             _wait_loaded(viewer)
             if tab is not None:
@@ -105,16 +99,3 @@ def _still_frame(viewer: Any) -> bytes:
             break
         pause.wait(_PAUSE_S)
     return frame
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-    return port
-
-
-def _viewer() -> str | None:
-    """The viewer of this Python's own installation, which matches the library; else the one on the path."""
-    beside = Path(sys.executable).with_name("rerun")
-    return str(beside) if beside.is_file() else shutil.which("rerun")
