@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import NoReturn
 
-from scenarios import analyse_command, fly_command, hil_command, restore_command, sitl_command
+from scenarios import analyse_command, fly_command, hil_command, restore_command, review_command, sitl_command
 from scenarios.identification import identify_command
 from scenarios.study import study_command
 from scenarios.tuning import tune_command
@@ -70,6 +70,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     hil_command.add_arguments(sub)
     _vehicle_options(sub)
+
+    sub = add(
+        "review",
+        _review,
+        "Look at a run: in the viewer, a browser, a picture or a report. List runs; compare two or more.",
+        "froude review --web",
+    )
+    review_command.add_arguments(sub)
 
     sub = add(
         "restore",
@@ -224,6 +232,10 @@ def _hil(args: argparse.Namespace) -> int:
     from sitl.vehicle_spec import DEFAULT_SCALING
 
     return hil_command.run(args, scaling=_words(args.scaling, DEFAULT_SCALING), seed=_seed(args), tell=_tell)
+
+
+def _review(args: argparse.Namespace) -> int:
+    return review_command.run(args, tell=_tell)
 
 
 def _restore(args: argparse.Namespace) -> int:
