@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Final, Self
 
 from scenarios.recorder.viewer import HOST, free_port, started, wait_until_listening
@@ -84,14 +84,16 @@ class WebViewer:
 
     Args:
         recordings: .rrd files, the one to be shown first at the front.
-        page: path -> bytes, of `viewer_page`.
         port: of 127.0.0.1; 0 for any that is free.
+
+    Attributes:
+        page: path -> bytes, of `viewer_page`; set it before `serve`.
 
     Raises:
         UsageError: the port is taken.
     """
 
-    def __init__(self, recordings: Sequence[Path], page: Mapping[str, bytes], port: int = PORT) -> None:
+    def __init__(self, recordings: Sequence[Path], port: int = PORT) -> None:
         self._files = {f"{RECORDINGS}{number}/{path.name}": path for number, path in enumerate(recordings)}
         try:
             self._server = _Server((HOST, port), _Handler)
@@ -100,7 +102,16 @@ class WebViewer:
                 f"port {port} of {HOST} cannot be used: {getattr(error, 'strerror', None) or error}. Give another one "
                 "with --port, or 0 for any that is free"
             ) from error
-        self._server.page, self._server.files = page, self._files
+        self._server.files = self._files
+
+    @property
+    def page(self) -> Mapping[str, bytes]:
+        """Files of the page; none until they are set."""
+        return self._server.page
+
+    @page.setter
+    def page(self, page: Mapping[str, bytes]) -> None:
+        self._server.page = page
 
     @property
     def port(self) -> int:
@@ -133,7 +144,7 @@ class WebViewer:
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
-    page: Mapping[str, bytes]
+    page: Mapping[str, bytes] = MappingProxyType({})
     files: Mapping[str, Path]
 
 
