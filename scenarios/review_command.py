@@ -179,11 +179,12 @@ def _recording(stored: StoredRun, flight: str, tell: Tell) -> Path:
     if not left:
         problem = "there is nothing to look at: neither compare.rrd nor a flight's recording is there"
         raise FileError(stored.folder, problem, "`froude fly` makes a new run")
+    # of a killed run, what was in the air
+    shown = next((one for one in left if not one.finished), left[-1])
     names = ", ".join(one.slug for one in left)
-    tell(f"{stored.name}: no comparison, so the flight {left[-1].slug} is shown; with --flight any of {names}")
-    recording = left[-1].recording
-    assert recording is not None
-    return recording
+    tell(f"{stored.name}: no comparison, so the flight {shown.slug} is shown; with --flight any of {names}")
+    assert shown.recording is not None
+    return shown.recording
 
 
 def _draw(recording: Path, args: argparse.Namespace, tell: Tell) -> int:

@@ -50,7 +50,8 @@ RELATIVE = 0.05
 """Of the older value, where that is more: the amplitude of a limit cycle is known to 5 %."""
 
 RANKS = {"PASS": 0, "INFO": 0, "UNSET": 1, "FAIL": 2}
-"""Verdicts; a larger one is worse. A flight without limits cannot be worse than one that held them."""
+"""Verdicts; a larger one is worse. A flight without limits cannot be worse than one that held them, and one that could
+not be judged is no better than one that failed."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ class FlightChange:
     Attributes:
         name: in the newer run; of the older one, if it is only there.
         old, new: the flights; None: that run has not flown it.
-        verdict: "same", "better", "worse"; empty if only one run has flown it.
+        verdict: "same", "better", "worse", or "other" (FAIL, and now UNSET); empty if only one run has flown it.
         parameters: those that differ: name -> (old, new), None: not stated.
         identical: the same telemetry, bit for bit.
         metrics: of the whole flight.
@@ -146,6 +147,7 @@ def compare(old: StoredRun, new: StoredRun) -> RunChange:
     rest = []
     for flight in (*new.flights, *([new.baseline] if new.baseline else [])):
         match = next((one for one in left if one.name == flight.name), None)
+        match = match or next((one for one in left if one.slug == flight.slug), None)
         if match is None:
             rest.append(flight)
         else:
@@ -179,14 +181,17 @@ def _flight_change(old: StoredFlight | None, new: StoredFlight | None) -> Flight
         new.name,
         old,
         new,
-        "same" if step == 0 else "worse" if step > 0 else "better",
+        "same" if step == 0 else "worse" if step > 0 else "better" if new.outcome != "UNSET" else "other",
         differing,
         len(fingerprints) == 1 and "" not in fingerprints,
-        tuple(_metric_change(name, old.metric(name), new.metric(name)) for name in names),
+        tuple(_metric_change(name, old.metric(name), new.metric(name), limited=new.known) for name in names),
     )
 
 
-def _metric_change(name: str, old: Mapping[str, Any] | None, new: Mapping[str, Any] | None) -> MetricChange:
+def _metric_change(
+    name: str, old: Mapping[str, Any] | None, new: Mapping[str, Any] | None, *, limited: bool
+) -> MetricChange:
+    """Of one metric; `limited`: the newer run tells its limits, else those of the older one count."""
     sense, tolerance = SENSES.get(name, (NEITHER, 0.0))
     before, after = _value(old, sense), _value(new, sense)
     difference = None
@@ -201,7 +206,7 @@ def _metric_change(name: str, old: Mapping[str, Any] | None, new: Mapping[str, A
             change = "same"
         else:
             change = "other" if sense == NEITHER else "worse" if worse > 0 else "better"
-    limit = None if new is None else new["limit"]
+    limit = ((new if limited else old) or {}).get("limit")
     outcome = "UNSET" if new is None else str(new["outcome"])
     was = "UNSET" if old is None else str(old["outcome"])
     crossed = outcome == "FAIL" and was != "FAIL"

@@ -7,12 +7,14 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from scenarios.limits import MILLISECONDS, TITLES
+from scenarios.limits import MILLISECONDS, TITLES, Limit
 from scenarios.run_comparison import FlightChange, MetricChange, RunChange
 from scenarios.run_text import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from scenarios.run_reader import StoredRun
 
 SCHEMA_VERSION = 1
 WORDS: Mapping[str, tuple[str, str]] = {
@@ -122,7 +124,7 @@ def _print_change(console: Console, change: RunChange) -> None:
             console.print(f"  {which}: {printable(problem)}", soft_wrap=True)
     for flight in change.flights:
         console.print()
-        _print_flight(console, flight)
+        _print_flight(console, flight, change.new)
     console.print()
     worse = change.regressions
     names = ", ".join(printable(flight.name) for flight in worse)
@@ -134,7 +136,7 @@ def _print_change(console: Console, change: RunChange) -> None:
     )
 
 
-def _print_flight(console: Console, flight: FlightChange) -> None:
+def _print_flight(console: Console, flight: FlightChange, new_run: StoredRun) -> None:
     from rich.table import Table
     from rich.text import Text
 
@@ -160,12 +162,13 @@ def _print_flight(console: Console, flight: FlightChange) -> None:
         console.print("  the same telemetry, bit for bit")
     shown = [metric for metric in flight.metrics if metric.limit or metric.change not in ("same", "none")]
     if shown:
+        limits = {one["metric"]: one for one in new_run.data["scenario"]["limits"]}
         table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
         for title in ("  metric", "old", "new", "difference", "limit", ""):
             table.add_column(title, justify="left" if title in ("  metric", "") else "right", overflow="fold")
         for metric in shown:
             word, style = _word(metric)
-            table.add_row(*_cells(metric), Text(word, style=style))
+            table.add_row(*_cells(metric, limits), Text(word, style=style))
         console.print(table)
     rest = sum(metric.change == "same" for metric in flight.metrics if metric not in shown)
     if rest and shown:
@@ -177,13 +180,17 @@ def _word(metric: MetricChange) -> tuple[str, str]:
     return (f"{word}   {REGRESSION}".strip(), "bold red") if metric.regression else (word, style)
 
 
-def _cells(metric: MetricChange) -> tuple[str, str, str, str, str]:
+def _cells(metric: MetricChange, limits: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, str, str, str]:
     factor = 1000.0 if metric.name in MILLISECONDS else 1.0
     unit = "ms" if factor != 1.0 else "" if metric.unit == "1" else metric.unit
     title = f"  {TITLES.get(metric.name, printable(metric.name))}" + (f" [{printable(unit)}]" if unit else "")
     old, new = (_number(value, factor) for value in (metric.old, metric.new))
     difference = "" if metric.difference is None else f"{metric.difference * factor:+.3g}"
-    return title, old, new, "0" if metric.difference == 0 else difference, printable(metric.limit or "")
+    limit = metric.limit or ""
+    if limit and metric.name in limits and metric.name in TITLES:  # in the unit of the values beside it
+        bounds = limits[metric.name]
+        limit = Limit(metric.name, bounds["minimum"], bounds["maximum"]).for_people()
+    return title, old, new, "0" if metric.difference == 0 else difference, printable(limit)
 
 
 def _number(value: float | None, factor: float) -> str:

@@ -115,7 +115,7 @@ class StoredRun:
             return found[0]
         names = [one.name + (" (own autopilot)" if one.own else "") for one in self.everything]
         if found:
-            raise UsageError(f"{self.folder}: {name!r} is in the names of {len(found)} flights. Give one of {names}")
+            raise UsageError(f"{self.folder}: {name!r} is in the names of several flights. It has {', '.join(names)}")
         if not names:
             raise UsageError(f"{self.folder}: holds no flight, and so none that is called {name!r}")
         raise UsageError(f"{self.folder}: no flight {name!r}{nearest(name, names)}. It has {', '.join(names)}")
@@ -176,8 +176,8 @@ def read_run(path: Path) -> StoredRun:
             raise _no_run(folder, error) from error
         why = "" if (folder / RUN_JSON).exists() else ": the run was killed, or is still being flown"
         problems.append(
-            f"{RUN_JSON} {error.problem}{why}. Verdicts, metrics and segments are not known; the rest is read off the "
-            "flights' files"
+            f"{RUN_JSON} {error.problem}{why}. Segments, limits and assumptions are not known; the rest is read off "
+            "the flights' files"
         )
     if data is None:
         return _from_files(folder, files, problems)

@@ -199,6 +199,15 @@ def conform(run: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
     return whole, tuple(wrong)
 
 
+def fitted(value: Any, rule: Any) -> Any:
+    """A value made to obey a rule, without complaints.
+
+    Args:
+        value: of a part of a run. rule: of this module.
+    """
+    return _checked(value, rule, "", [])
+
+
 def nothing(rule: Any) -> Any:
     """What stands for a value that is not there: every key of an object, each with its own nothing."""
     if isinstance(rule, Kind):

@@ -17,13 +17,16 @@ from pathlib import Path
 from typing import Any
 
 from bridge.tlog import SIMULATED_EPOCH_US
-from scenarios.run_shape import FLIGHT, nothing
+from scenarios.run_shape import FLIGHT, METRIC, fitted, nothing
 from sitl.errors import FileError
 
 FLIGHTS = "flights"
 OWN = ".own"
 SUFFIXES = (".partial.rrd", ".partial.tlog", ".backup.params", ".rrd", ".parquet", ".tlog", ".params")
 """Longest first: `x.partial.rrd` is no `.rrd`."""
+
+_SEVERITIES = {"CRITICAL": 2, "ERROR": 3, "WARN": 4, "INFO": 6, "DEBUG": 7}
+"""MAV_SEVERITY of each of Rerun's levels that a recording of ours has."""
 
 _V1, _V2 = 0xFE, 0xFD
 _SIGNED = 0x01
@@ -38,7 +41,8 @@ class StoredFlight:
         data: as in `run.json`; every key is there.
         files: kind without its first dot (`rrd`, `partial.rrd`, `parquet`, `tlog`, `partial.tlog`, `params`,
             `backup.params`) -> path; only what exists.
-        known: `run.json` tells of it; False: put together from its files, verdict, metrics and segments unknown.
+        known: `run.json` tells of it; False: put together from its files. Then segments and limits are not known, and
+            verdict and metrics only if its recording was finished.
         own: our own autopilot flew it beside a real one.
     """
 
@@ -150,10 +154,43 @@ def from_files(slug: str, files: Mapping[str, Path]) -> tuple[StoredFlight, tupl
     data["gain_set"] |= {"name": name, "parameters": uploaded}
     data["uploaded"] = uploaded
     data["files"] = {kind: f"{FLIGHTS}/{path.name}" for kind, path in files.items()}
-    data["reason"] = (
-        "not judged: the run ended before its result was written" if "rrd" in files else "killed in flight: not judged"
-    )
+    data["reason"] = "the result is not known" if "rrd" in files else "killed in flight: not judged"
+    recording = files.get("rrd") or files.get("partial.rrd")
+    if recording is not None:
+        try:
+            data |= _recorded(recording)
+        except FileError as error:
+            problems.append(f"{FLIGHTS}/{recording.name}: {error.problem}")
+    recorded_name = data.pop("recorded_name", "")
+    if name == slug.removesuffix(OWN):  # the telemetry did not tell
+        data["gain_set"]["name"] = name = recorded_name or name
     return StoredFlight(name, slug, data, files, known=False, own=own), tuple(problems)
+
+
+def _recorded(recording: Path) -> dict[str, Any]:
+    """What a recording tells of its flight, as in `run.json`; limits are not in it."""
+    from scenarios.limits import METRICS
+    from scenarios.recorder.recorded_facts import recorded_facts
+
+    facts = recorded_facts(recording)
+    told: dict[str, Any] = {
+        "recorded_name": facts.name,
+        "events": [
+            {"t_s": time_s, "severity": _SEVERITIES.get(level, 6), "text": text} for time_s, level, text in facts.events
+        ],
+    }
+    verdict = facts.properties.get("verdict", {})
+    told |= {
+        key: verdict[key] for key in ("outcome", "reason", "vehicle", "seed", "telemetry_sha256") if key in verdict
+    }
+    told["metrics"] = [
+        nothing(METRIC)
+        | {"name": name, "value": value, "outcome": "INFO", "unit": METRICS[name][0], "meaning": METRICS[name][1]}
+        for name, value in facts.properties.get("metrics", {}).items()
+        if name in METRICS
+    ]
+    whole = fitted(told, FLIGHT)  # what a damaged recording tells passes the same customs as a damaged run.json
+    return {key: whole[key] for key in told}
 
 
 def _text(about: Mapping[str, Any], key: str) -> str:
