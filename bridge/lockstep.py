@@ -128,6 +128,9 @@ class Lockstep:
         try:
             self.link.send(self.simulator.frames())
             self.report.steps += 1
+            # done while the autopilot works
+            if self.report.steps % _LOOK_STEPS == 0:
+                self._look_at_port()
             answer = self._answer() if self.locked else self._first_answer()
         except PeerLost as lost:
             self._lost(lost)
@@ -140,8 +143,6 @@ class Lockstep:
             self.motors = ()
             self._fault("its last motor commands are 2 s old: motors stopped")
         self._look_at_values()
-        if self.report.steps % _LOOK_STEPS == 0:
-            self._look_at_port()
         self.body.step(self.motors)
 
     # -- waiting -----------------------------------------------------------------------------------------------

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from bridge.connection import Connection, Message
 from bridge.telemetry import int16, int32, uint16
@@ -19,6 +18,10 @@ SIM_SYSID, SIM_COMPID = 254, 51
 
 IMU, MAG, BARO = 0x3F, 0x1C0, 0x1A00
 """Groups of fields_updated; a group that is not complete is ignored by the autopilot."""
+
+TRUTH_US = 20_000
+"""Least interval of the truth, however often it is asked for: a PX4 asks for 200 Hz and logs it; each costs both sides
+time that the lockstep waits for, and a run's own record has it for every tick anyway."""
 
 SLOW_TICKS = 5
 """Ticks between two readings of magnetometer and barometer: 50 Hz."""
@@ -31,8 +34,7 @@ _COG_UNKNOWN = 65535
 _KEPT = 64
 
 
-@dataclass(frozen=True)
-class Actuators:
+class Actuators(NamedTuple):
     """One HIL_ACTUATOR_CONTROLS, made safe.
 
     Attributes:
@@ -120,7 +122,8 @@ class Simulator:
             self.is_px4 = message.autopilot == _PX4
         elif message.name == "COMMAND_LONG" and message.command == 511 and message.param1 == 115:
             interval = float(message.param2)
-            self._truth_interval_us = int(interval) if interval > 0.0 and math.isfinite(interval) else None
+            wanted = interval > 0.0 and math.isfinite(interval)
+            self._truth_interval_us = max(TRUTH_US, int(interval)) if wanted else None
         self.others.append(message)
         return None
 
@@ -133,8 +136,17 @@ class Simulator:
         self.others.clear()
 
     def _actuators(self, message: Message) -> Actuators:
+        controls: tuple[float, ...] = message.controls
+        # a sum with a NaN or an infinity in it is one itself
+        if not (math.isfinite(sum(controls)) and min(controls) >= 0.0 and max(controls) <= 1.0):
+            controls = self._made_safe(controls)
+        return Actuators(
+            int(message.time_usec), controls, bool(message.mode & _ARMED), bool(message.flags & _LOCKSTEP)
+        )
+
+    def _made_safe(self, controls: tuple[float, ...]) -> tuple[float, ...]:
         motors = []
-        for value in message.controls:
+        for value in controls:
             if not math.isfinite(value):
                 self.not_numbers += 1
                 motors.append(0.0)
@@ -142,9 +154,7 @@ class Simulator:
                 if not -1.0 <= value <= 1.0:
                     self.outside += 1
                 motors.append(min(1.0, max(0.0, value)))
-        return Actuators(
-            int(message.time_usec), tuple(motors), bool(message.mode & _ARMED), bool(message.flags & _LOCKSTEP)
-        )
+        return tuple(motors)
 
 
 def sensor_fields(body: Body) -> dict[str, Any]:

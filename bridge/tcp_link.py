@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 import select
 import socket
+import struct
 
 from bridge.clock import WallClock
 from bridge.errors import LinkClosed, PeerLost, PeerSilent
@@ -14,6 +15,10 @@ from bridge.udp_link import bind, resolve
 _CHUNK = 8_192
 _STUCK_S = 1.0
 _RETRY_US = 50_000
+
+_KERNEL_WAITS_S = 0.02
+"""Time limits from here on are left to the kernel, whose clock is too coarse for shorter ones: one call less for every
+answer of an autopilot in lockstep."""
 
 
 class TcpLink(Link):
@@ -34,9 +39,9 @@ class TcpLink(Link):
         self._closed = False
         self._lost: str | None = None
         self._clock = WallClock()
-        for sock in (listener, peer):
-            if sock is not None:
-                sock.setblocking(False)
+        self._limit_s = 0.0
+        if listener is not None:
+            listener.setblocking(False)
         if peer is not None:
             _at_once(peer)
 
@@ -110,7 +115,7 @@ class TcpLink(Link):
         view = memoryview(data)
         while view:
             try:
-                view = view[peer.send(view) :]
+                view = view[peer.send(view, socket.MSG_DONTWAIT) :]
             except BlockingIOError:
                 if not select.select([], [peer], [], _STUCK_S)[1]:
                     raise self._parted(f"it read nothing for {_STUCK_S:g} s") from None
@@ -119,23 +124,33 @@ class TcpLink(Link):
 
     def recv(self, timeout_s: float = 0.0) -> bytes | None:
         """Return what has arrived, taking the next peer if there is none."""
-        deadline_us = self._clock.now_us() + int(timeout_s * 1e6) if timeout_s > 0.0 else 0
         peer = self._present(timeout_s)
         if peer is None:
             return None
-        while True:
-            try:
+        try:
+            if timeout_s >= _KERNEL_WAITS_S:
+                if timeout_s != self._limit_s:
+                    self._limit(peer, timeout_s)
                 data = peer.recv(_CHUNK)
-            except BlockingIOError:
-                remaining_s = (deadline_us - self._clock.now_us()) * 1e-6 if deadline_us else 0.0
-                if remaining_s <= 0.0 or not select.select([peer], [], [], remaining_s)[0]:
-                    return None
-                continue
-            except OSError as error:
-                raise self._parted(error.strerror or str(error)) from None
-            if not data:
-                raise self._parted("it closed the connection")
-            return data
+            elif timeout_s > 0.0 and not select.select([peer], [], [], timeout_s)[0]:
+                return None
+            else:
+                data = peer.recv(_CHUNK, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return None
+        except OSError as error:
+            raise self._parted(error.strerror or str(error)) from None
+        if not data:
+            raise self._parted("it closed the connection")
+        return data
+
+    def _limit(self, peer: socket.socket, timeout_s: float) -> None:
+        """Let the kernel end a reception that takes longer."""
+        self._limit_s = timeout_s
+        whole_s = int(timeout_s)
+        peer.setsockopt(
+            socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", whole_s, round((timeout_s - whole_s) * 1e6))
+        )
 
     def close(self) -> None:
         """Release the port and the peer."""
@@ -159,9 +174,8 @@ class TcpLink(Link):
             peer, _ = self._listener.accept()
         except (BlockingIOError, ConnectionAbortedError):
             return None
-        peer.setblocking(False)
         _at_once(peer)
-        self._peer = peer
+        self._peer, self._limit_s = peer, 0.0
         return peer
 
     def turn_away(self) -> bool:
@@ -212,5 +226,6 @@ def turn_out(link: Link) -> bool:
 
 
 def _at_once(sock: socket.socket) -> None:
+    sock.setblocking(True)
     # A control loop's frames must not wait in the kernel to be joined with later ones.
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -92,9 +92,11 @@ class Body:
         Args:
             motors: commands 0..1 in PX4's motor order, held over the tick; what is missing stands still.
         """
-        count = min(len(motors), MAX_MOTORS)
-        self._commands[:count] = motors[:count]
-        self._commands[count:] = 0.0
+        if len(motors) >= MAX_MOTORS:
+            self._commands[:] = motors[:MAX_MOTORS]
+        else:
+            self._commands[: len(motors)] = motors
+            self._commands[len(motors) :] = 0.0
         self.plant.step(self._commands)
         self.tick += 1
         self.sensors.sample(self.time_us)
