@@ -60,7 +60,7 @@ def _holds() -> Conclusion:
         "integrator of any gain drives the loop away. "
         + (
             f"There are such models of {', '.join(exceptions)}: with them no set, the study's or ours, flies every "
-            "sample of every draw."
+            "sample of every draw, and models next to them settle late whatever the gains."
             if exceptions
             else "There is no such model."
         ),

@@ -46,11 +46,12 @@ def _kinds(study: Study) -> list[dict[str, Any]]:
         n, g = line_of(pair), pair.gains
         title = f"{'Gains tuned here' if pair.source.startswith('tuned') else 'Printed gains'}, profile {pair.profile}"
         cells = [pair.target, pair.based_on + (" (itself)" if pair.based_on == pair.target else "")]
+        cells.append(number(100.0 * n.meets, 1))
         cells += [f"{value:.4g}" for value in (g.k_phi, g.kp, g.ki, g.kd)]
         cells += [number(n.settling_s[0], 3), number(n.settling_s[1], 3), number(n.overshoot_pct)]
         cells += [number(n.vaf_pct, 1), number(n.peak_delta_lat), number(n.phase_margin_deg, 1)]
         cells += [number(1e3 * n.delay_margin_s, 1), number(n.gain_margin_high_db, 1), number(n.oscillation_rad_s)]
-        kinds.setdefault(title, []).append([*cells, number(100.0 * n.meets, 1)])
+        kinds.setdefault(title, []).append(cells)
     return [{"title": title, "rows": rows} for title, rows in kinds.items()]
 
 
