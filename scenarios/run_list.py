@@ -64,23 +64,15 @@ def run_folders(out: Path) -> list[Path]:
     """
     try:
         with os.scandir(out) as entries:
-            found = sorted(entries, key=lambda entry: (entry.is_symlink(), entry.name))
+            found = list(entries)
     except FileNotFoundError:
         return []
     except OSError as error:
         raise FileError(out, f"cannot be read: {error.strerror or error}", "Give another folder with --out") from error
-    seen: set[tuple[int, int]] = set()
     runs = []
     for entry in found:
         key = _run_key(entry)
-        if key is None:
-            continue
-        try:
-            here = entry.stat()
-        except OSError:
-            continue
-        if (here.st_dev, here.st_ino) not in seen:
-            seen.add((here.st_dev, here.st_ino))
+        if key is not None and not (entry.is_symlink() and Path(entry.path).resolve().parent == out.resolve()):
             runs.append((key, Path(entry.path)))
     return [path for _, path in sorted(runs, reverse=True)]
 

@@ -32,8 +32,11 @@ RUN_JSON, COMPARE, REPORT = "run.json", "compare.rrd", "report.html"
 LARGEST_JSON = 400_000_000
 """Bytes. A run of a thousand gain sets has a twentieth of it."""
 
-STAMPED = re.compile(r"(\d{4})(\d\d)(\d\d)T(\d\d)(\d\d)(\d\d)Z_(.+)_([^_]+?)(?:_(\d+))?")
+STAMPED = re.compile(r"(\d{4})(\d\d)(\d\d)T(\d\d)(\d\d)(\d\d)Z_(.+?)_([^_]+?)(?:_(\d+))?")
 """Name of a run's folder: date, time, scenario, vehicle, and a number for the second of its kind in one second."""
+
+
+_HALF = re.compile(r"\\u[dD][89a-fA-F]")
 
 
 class StoredRun:
@@ -226,11 +229,21 @@ def load_json(file: Path) -> tuple[Any, list[str]]:
         told.append(f"{RUN_JSON} is damaged: byte {error.start} is no text")
     try:
         # JSON has no NaN; where damage or another program made one, it is no value
-        return json.loads(text, parse_constant=lambda _: None), told
+        run = json.loads(text, parse_constant=lambda _: None)
+        return (_encodable(run) if _HALF.search(text) else run), told
     except ValueError as error:
         raise FileError(file, f"is not JSON: {error}", remedy) from error
     except RecursionError:
         raise FileError(file, "is not JSON of a run: it is nested too deeply", remedy) from None
+
+
+def _encodable(value: Any) -> Any:
+    """Half a character, which JSON can write and no output takes, becomes `?`."""
+    if isinstance(value, str):
+        return value.encode(errors="replace").decode()
+    if isinstance(value, list):
+        return [_encodable(item) for item in value]
+    return {_encodable(key): _encodable(item) for key, item in value.items()} if isinstance(value, dict) else value
 
 
 def _no_run(folder: Path, error: FileError) -> FileError:
