@@ -78,6 +78,7 @@ def _parser() -> argparse.ArgumentParser:
         "froude review --web",
     )
     review_command.add_arguments(sub)
+    _vehicle_options(sub)
 
     sub = add(
         "restore",

@@ -9,6 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from scenarios import flight_import
+
 if TYPE_CHECKING:
     from scenarios.run_choice import Choice
     from scenarios.run_reader import StoredRun
@@ -16,7 +18,6 @@ if TYPE_CHECKING:
 EXIT_OK, EXIT_GATE = 0, 1
 OUT = Path("logs")
 LISTED = 30
-IMPORTED = (".ulg", ".tlog")
 
 Tell = Callable[[str], object]
 
@@ -44,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--last", type=int, metavar="N", help=f"with --list: so many runs (default: {LISTED}; with --json all)")
     add("--gate", action="store_true", help="comparing: exit status 1 if a gain set got worse")
     add("--json", action="store_true", help="with --list, or comparing: for machines")
+    flight_import.add_arguments(parser)
 
 
 def run(args: argparse.Namespace, *, tell: Tell) -> int:
@@ -60,11 +62,8 @@ def run(args: argparse.Namespace, *, tell: Tell) -> int:
     _check(args)
     if args.list:
         return _list(args)
-    if any(Path(word).suffix.lower() in IMPORTED for word in args.runs):
-        import importlib
-
-        status: int = importlib.import_module("scenarios.flight_import").import_command(args, tell=tell)
-        return status
+    if any(flight_import.is_recording(Path(word)) for word in args.runs):
+        return flight_import.import_command(args, tell=tell)
     choices = [choose(word, args.out) for word in args.runs] or [newest_choice(args.out)]
     if len(choices) > 1:
         return _compare(choices, args)
@@ -76,13 +75,18 @@ def _check(args: argparse.Namespace) -> None:
     from sitl.errors import UsageError
 
     several = len(args.runs) > 1
-    imported = any(Path(word).suffix.lower() in IMPORTED for word in args.runs)
+    imported = any(flight_import.is_recording(Path(word)) for word in args.runs)
     for option, given, fits, what in (
         ("--port", args.port is not None, args.web, "goes with --web"),
         ("--page", args.page is not None, args.screenshot is not None, "goes with --screenshot FILE"),
         ("--open", args.open, args.html, "goes with --html"),
         ("--last", args.last is not None, args.list, "goes with --list"),
         ("--gate", args.gate, (several or imported) and not args.list, "compares: give two runs or more"),
+        ("--vehicle", args.vehicle is not None, imported, "goes with a .ulg or .tlog"),
+        ("--limits", args.limits is not None, imported, "goes with a .ulg or .tlog"),
+        ("--profile", args.profile is not None, imported, "goes with a .ulg or .tlog"),
+        ("--scaling", args.scaling is not None, imported, "goes with a .ulg or .tlog"),
+        ("--system", args.system is not None, imported, "goes with a .tlog"),
         ("--json", args.json, args.list or several or imported, "goes with --list, or two runs or more"),
         ("--flight", args.flight is not None, not (args.list or args.html), "shows a recording"),
     ):
@@ -211,15 +215,15 @@ def _serve(recordings: Sequence[Path], args: argparse.Namespace, tell: Tell) -> 
 
 
 def _report(stored: StoredRun, args: argparse.Namespace) -> int:
-    import importlib
     import webbrowser
 
     from scenarios.recorder.viewer import has_display
+    from scenarios.report import write_report
     from sitl.errors import UsageError
 
     path = stored.report
     if not path.is_file():
-        path = Path(importlib.import_module("scenarios.report").write_report(stored.folder))
+        path = write_report(stored.folder)
     _print(str(path))
     looked_at = sys.stdout is not None and sys.stdout.isatty() and has_display()
     if (args.open or looked_at) and not webbrowser.open(path.resolve().as_uri()) and args.open:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from scenarios.flight_import import is_recording
 from scenarios.markdown import markdown_table
 from scenarios.table import COLUMNS, SPARED, UNSET, WIDE, cells, number
 from scenarios.twin import Quantity, Twin
@@ -136,8 +137,11 @@ def _sentence(one: Quantity) -> str:
 def headline(twins: Sequence[Twin]) -> str:
     """How many gain sets agree."""
     agreeing = sum(twin.difference.agree for twin in twins)
+    what = "The real autopilot beside our own, same gains, plant and seed"
+    if any(twin.flight.gain_set.path and is_recording(twin.flight.gain_set.path) for twin in twins):
+        what = "The recorded flight beside our own autopilot on the model, same gains and set-points"
     return (
-        f"The real autopilot beside our own, same gains, plant and seed: {agreeing} of {len(twins)} "
+        f"{what}: {agreeing} of {len(twins)} "
         f"gain set{'s' if len(twins) != 1 else ''} agree{'s' if len(twins) == 1 else ''} within the tolerances."
     )
 
