@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import platform
 import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,8 +20,10 @@ from scenarios.gain_set import GainSet, check, flies_gains, flight_gain_paramete
 from scenarios.hil_session import geometry_parameters
 from scenarios.limits import Outcome
 from scenarios.one_flight import MEMORY, FlightJob, FlightStoppedError, fly
+from scenarios.run_files import report_draft, write_run
 from scenarios.run_folder import RunFolder, vehicle_description
 from scenarios.scenario import Scenario
+from scenarios.versions import versions
 from sitl.errors import FroudeError, LinkError, UsageError
 from sitl.parameters import ParameterTable, ParameterType
 from sitl.profile import Profile
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
     from scenarios.twin import Twin
 
 __all__ = ["Progress", "RunOptions", "RunResult", "plan", "run_scenario", "versions"]
-
-LIBRARIES = ("numpy", "scipy", "numba", "control", "pymavlink", "pyarrow", "rerun-sdk")
 
 
 @dataclass(frozen=True)
@@ -53,6 +52,7 @@ class RunOptions:
         px4: build directory of a PX4 that is started for every flight; None for none.
         say: called with a line for people.
         twin: where a real autopilot flies our plant, our own flies it, too, to compare the two.
+        report: write `report.html`, where a folder is kept.
     """
 
     out: Path | None = Path("logs")
@@ -65,6 +65,7 @@ class RunOptions:
     px4: Path | None = None
     say: Callable[[str], object] = lambda _: None
     twin: bool = True
+    report: bool = True
 
     def __post_init__(self) -> None:
         """Raise UsageError for options that exclude each other, before anything is read."""
@@ -141,6 +142,13 @@ def run_scenario(
     Raises:
         UsageError, FileError: before anything is flown: a bad file, name or number.
     """
+    with ExitStack() as stack:
+        return _run_scenario(scenario, options, progress, stack)
+
+
+def _run_scenario(
+    scenario: Scenario, options: RunOptions, progress: Callable[[Progress], object], stack: ExitStack
+) -> RunResult:
     model = scenario.resolve_vehicle()
     profile = scenario.resolve_profile()
     gain_sets = load_all(scenario.gain_sets)
@@ -167,6 +175,10 @@ def run_scenario(
         )
         for job in planned
     ]
+    draft = None
+    if folder is not None and options.report:
+        known = RunRecord(scenario, vehicle_description(model), tuple(profile.describe()), ())
+        draft = stack.enter_context(report_draft(known, jobs, len(candidates)))
     twins: tuple[Twin, ...] = ()
     if options.is_hil:
         flown, twins = _fly_real(jobs, planned, options, progress)
@@ -195,21 +207,11 @@ def run_scenario(
         progress(Progress(len(jobs), len(jobs), "run", "write"))
         try:
             with interrupts.held():
-                _write(run, folder, options)
+                write_run(run, folder, options.command, draft, options.say)
         except (FroudeError, KeyboardInterrupt) as error:
             # the flights themselves are on disk; the table is still worth printing
             stopped = stopped or error
     return RunResult(run, folder.path if folder else None, stopped, flown.owed)
-
-
-def _write(run: RunRecord, folder: RunFolder, options: RunOptions) -> None:
-    """The run's own files; run.json first, so that it is there even if there is no room for the comparison."""
-    from scenarios.junit import write_junit
-    from scenarios.recorder.comparison import record_compare
-
-    folder.write_run_json(run, options.command)
-    write_junit(run, folder.path / "junit.xml")
-    record_compare(run, folder.compare)
 
 
 def plan(gain_set: GainSet, scenario: Scenario, model: VehicleModel, profile: Profile) -> FlightJob:
@@ -381,16 +383,3 @@ def _extended(stamp: str) -> str:
     """ISO 8601 with its separators, as JUnit's readers want it, of a file name's `20261122T200455Z`."""
     day, clock = stamp.rstrip("Z").split("T")
     return f"{day[:4]}-{day[4:6]}-{day[6:]}T{clock[:2]}:{clock[2:4]}:{clock[4:]}Z"
-
-
-def versions() -> dict[str, str]:
-    """This program's version, Python's and the libraries'."""
-    found = {"froude": _version("froude"), "python": platform.python_version()}
-    return found | {name: _version(name) for name in LIBRARIES}
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "unknown"

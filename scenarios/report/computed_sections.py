@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,8 +13,8 @@ from scenarios.analysis import sensitivity, spread, wilson
 from scenarios.report.computed import SAMPLES, SEED, Computed, LoopCurves, SampleSet
 from scenarios.report.elements import UNSET, Cell, Figure, Line, Section, Set, Sets, Table, heading, number_of
 from scenarios.report.loop_figures import DelayBar, DrawnLoop, bode_figure, delay_figure, sensitivity_figure
-from scenarios.report.sample_figures import Row, Share, share_figure, spread_figure
-from scenarios.report.verdict import shown, title, value_text
+from scenarios.report.sample_figures import Bounds, Entry, share_figure, spread_figure
+from scenarios.report.verdict import title, value_text
 from scenarios.table import number
 from sitl.vehicle_spec import VehicleModel
 
@@ -171,38 +171,64 @@ def delay_section(sets: Sets, found: Found) -> Section:
 
 def samples_section(sets: Sets, found: Found, model: VehicleModel | None) -> Section:
     """What becomes of the gain sets on uncertain models."""
-    name = "uncertain"
-    heading_ = "Uncertain models"
     known = [(one, found[one.number].samples) for one in sets.candidates]
     some = [(one, samples) for one, samples in known if samples is not None]
     problems = {found[one.number].problem for one, samples in known if samples is None} - {""}
     if not some or model is None:
         why = "; ".join(sorted(problems)) or "the airframe states no uncertainty, so there is nothing to vary"
-        return Section(name, heading_, [f"Not computed: {why}."])
+        return Section("uncertain", "Uncertain models", [f"Not computed: {why}."])
     lead = [
         f"{SAMPLES} random models within 3 sigma of the identified one (seed {SEED}), the same for every gain set, "
         "each flying the run's own manoeuvres on the roll axis alone, without noise. Histograms share an axis; upright "
-        "line: median; diamond: what was flown; dashed: the limit."
+        "line: median; diamond: the nominal model; dashed: the limit. The tables hold what was flown beside them."
     ]
-    shares = [_share(one, samples) for one, samples in some]
-    drawing = share_figure(shares, "share")
+    entries = tuple(Entry(one.name, one.style, samples) for one, samples in some)
+    drawing = share_figure(entries, "share")
     figures = [Figure("share", "How many models pass", drawing.svg, drawing.label, table=_share_table(some))]
-    limits = {one["metric"]: one for one in sets.run.data["scenario"]["limits"]}
-    for metric in sorted(SPREAD, key=lambda one: one not in limits):
-        figure = _spread(metric, some, found, limits.get(metric), model)
+    limits = bounds_of(sets.run.data)
+    for metric in spread_metrics(limits):
+        figure = _spread(metric, some, entries, found, limits.get(metric, (None, None)), model)
         if figure is not None:
             figures.append(figure)
     unsampled = [title(metric) for metric in limits if metric not in some[0][1].values]
     notes = [f"Limits that only a flight can tell are left out here: {', '.join(unsampled)}"] if unsampled else []
     notes += [f"{one.name}: {found[one.number].problem}" for one, samples in known if samples is None]
-    return Section(name, heading_, lead, (), figures, notes=notes)
+    return Section("uncertain", "Uncertain models", lead, (), figures, notes=notes)
 
 
-def _share(one: Set, samples: SampleSet) -> Share:
-    return Share(one.name, one.style, samples.passes, samples.of, wilson(samples.passes, samples.of))
+def bounds_of(data: Mapping[str, Any]) -> dict[str, Bounds]:
+    """Limits of a run: metric -> least and largest.
+
+    Args:
+        data: a `run.json`, or what is known of it before the flights.
+    """
+    return {one["metric"]: (one["minimum"], one["maximum"]) for one in data["scenario"]["limits"]}
 
 
-def _share_table(some: list[tuple[Set, SampleSet]]) -> Table:
+def spread_metrics(limits: Iterable[str]) -> list[str]:
+    """Metrics whose distribution is drawn, those with a limit first.
+
+    Args:
+        limits: metrics that are limited.
+    """
+    limited = set(limits)
+    return sorted(SPREAD, key=lambda metric: metric not in limited)
+
+
+def draw_samples(entries: tuple[Entry, ...], data: Mapping[str, Any]) -> None:
+    """Draw the figures of `samples_section`, which keep what is drawn.
+
+    Args:
+        entries: of all candidates. data: what is known of the run.
+    """
+    share_figure(entries, "share")
+    limits = bounds_of(data)
+    for metric in spread_metrics(limits):
+        if all(metric in one.samples.values for one in entries):
+            spread_figure(entries, metric, limits.get(metric, (None, None)), f"spread-{metric}")
+
+
+def _share_table(some: Sequence[tuple[Set, SampleSet]]) -> Table:
     rows = []
     for one, samples in some:
         low, high = wilson(samples.passes, samples.of)
@@ -219,34 +245,30 @@ def _share_table(some: list[tuple[Set, SampleSet]]) -> Table:
 
 def _spread(
     metric: str,
-    some: list[tuple[Set, SampleSet]],
+    some: Sequence[tuple[Set, SampleSet]],
+    entries: tuple[Entry, ...],
     found: Found,
-    limit: Mapping[str, Any] | None,
+    bounds: Bounds,
     model: VehicleModel,
 ) -> Figure | None:
-    unit, factor = shown(metric)
-    drawn, rows = [], []
+    if any(metric not in samples.values for _, samples in some):
+        return None
+    drawing = spread_figure(entries, metric, bounds, f"spread-{metric}")
+    if drawing is None:
+        return None
+    rows = []
     for one, samples in some:
-        if metric not in samples.values:
-            return None
         row = samples.values[metric]
         flown = one.flight.metric(metric)
-        value = None if flown is None else flown["value"]
-        drawn.append(Row(one.name, one.style, row[1:] * factor, None if value is None else value * factor))
         over = spread(metric, row)
         derivatives = found[one.number].derivatives
         assert derivatives is not None
         why = sensitivity(metric, row, derivatives, model)
-        cells = [value_text(metric, one_, unit=False) for one_ in (over.worst, over.median, over.best)]
         matters = f"{why.dominant} ({100.0 * why.shares[why.dominant]:.0f} %)" if why.dominant else UNSET
-        cells = [value_text(metric, value, unit=False), *cells, str(over.unset), matters]
+        values = [None if flown is None else flown["value"], over.nominal, over.worst, over.median, over.best]
+        cells = [*(value_text(metric, value, unit=False) for value in values), str(over.unset), matters]
         rows.append(Line(one.name, [Cell(text) for text in cells], one.style))
-    bounds = (None, None) if limit is None else (limit["minimum"], limit["maximum"])
-    scaled = tuple(None if bound is None else bound * factor for bound in bounds)
-    drawing = spread_figure(drawn, title(metric), unit, (scaled[0], scaled[1]), f"spread-{metric}")
-    if drawing is None:
-        return None
-    columns = ["flown", "worst", "median", "best", "not measured", "matters most"]
+    columns = ["flown", "nominal", "worst", "median", "best", "not measured", "matters most"]
     table = Table(f"{heading(metric)} over the models", "gain set", columns, rows)
     name = title(metric)
     return Figure(f"spread-{metric}", name[0].upper() + name[1:], drawing.svg, drawing.label, table=table)

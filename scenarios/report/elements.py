@@ -151,16 +151,27 @@ class Sets:
     @classmethod
     def of(cls, run: StoredRun) -> Sets:
         """The gain sets of a run."""
-        made = [Set(k, flight.name, flight, style_of(k)) for k, flight in enumerate(run.flights)]
-        if run.baseline is not None:
-            name = f"{run.baseline.name} (baseline)"
-            made.append(Set(len(made), name, run.baseline, BASELINE, baseline=True))
+        stored = [*run.flights, *([run.baseline] if run.baseline is not None else [])]
+        made = []
+        for number, flight in enumerate(stored):
+            baseline = flight is run.baseline
+            name, style = look_of(number, flight.name, baseline=baseline)
+            made.append(Set(number, name, flight, style, baseline))
         return cls(run, tuple(made))
 
     @property
     def candidates(self) -> tuple[Set, ...]:
         """Without the baseline."""
         return tuple(one for one in self.all if not one.baseline)
+
+
+def look_of(number: int, name: str, *, baseline: bool) -> tuple[str, Style]:
+    """What a gain set is called on the page, and how its line looks.
+
+    Args:
+        number: from 0, in the order of the run. name: of the gain set. baseline: it is no candidate.
+    """
+    return (f"{name} (baseline)", BASELINE) if baseline else (name, style_of(number))
 
 
 def metric_cell(metric: Mapping[str, Any] | None) -> Cell:

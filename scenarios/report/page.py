@@ -20,7 +20,7 @@ from scenarios.report.flown_sections import (
     warnings_section,
 )
 from scenarios.report.verdict import SIGNS, title, verdict_of
-from scenarios.run_reader import StoredRun
+from scenarios.run_reader import COMPARE, StoredRun
 
 TEMPLATE = "page.html.j2"
 
@@ -61,8 +61,8 @@ def report_page(run: StoredRun, done: Done | None = None, *, threads: int | None
         signs=SIGNS,
         sections=[section for section in sections if section is not None],
         command=shlex.join(run.data["command"]),
-        # read last: telemetry that is damaged was found on the way
-        problems=run.problems,
+        # read last: telemetry that is damaged was found on the way; compare.rrd is no part of this page
+        problems=[problem for problem in run.problems if not problem.startswith(COMPARE)],
     )
     return page
 

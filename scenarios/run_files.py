@@ -1,0 +1,66 @@
+"""What a run writes at its end: `run.json`, JUnit XML, the comparison, the report that was begun when it took off."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from scenarios.flight import RunRecord
+from scenarios.flight_job import FlightJob
+from scenarios.run_folder import RunFolder, run_object
+
+if TYPE_CHECKING:
+    from scenarios.report.drafting import ReportDraft
+
+
+def report_draft(known: RunRecord, jobs: Sequence[FlightJob], candidates: int) -> ReportDraft:
+    """The report of a run that is about to be flown; a context manager.
+
+    Args:
+        known: the run without its flights. jobs: what will be flown. candidates: the first so many are; the baseline
+            follows.
+    """
+    from scenarios.report.drafting import ReportDraft
+
+    sets = [
+        {
+            "name": job.gain_set.name,
+            "baseline": number >= candidates,
+            "uploaded": {name: value for name, (value, _) in job.parameters.items()},
+        }
+        for number, job in enumerate(jobs)
+    ]
+    return ReportDraft(run_object(known), sets)
+
+
+def write_run(
+    run: RunRecord,
+    folder: RunFolder,
+    command: Sequence[str],
+    draft: ReportDraft | None,
+    say: Callable[[str], object],
+) -> None:
+    """Write the run's own files; `run.json` first, so that it is there even if there is no room for the others.
+
+    Args:
+        run: as flown. folder: of the run. command: as typed. draft: of the report; None for no report.
+        say: called with a line for people if there is no report.
+
+    Raises:
+        FileError: a file cannot be written; the report alone is no reason.
+    """
+    from scenarios.junit import write_junit
+    from scenarios.recorder.comparison import record_compare
+
+    folder.write_run_json(run, command)
+    if draft is not None:
+        draft.begin(folder.path)
+    try:
+        write_junit(run, folder.path / "junit.xml")
+        record_compare(run, folder.compare)
+    finally:
+        if draft is not None:
+            try:
+                draft.finish()
+            except Exception as error:  # whatever it is, the flights are worth more than the page
+                say(f"warning: no report: {error}")
