@@ -165,7 +165,7 @@ def autopilot(command: Iterable[str]) -> str:
     """
     options: dict[str, str] = {}
     words = list(command)
-    for word, after in zip(words, [*words[1:], ""], strict=True):
+    for word, after in zip(words, (*words[1:], ""), strict=False):
         name, equals, value = word.partition("=")
         options[name] = value if equals else after
     if "--px4" in options:

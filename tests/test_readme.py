@@ -22,6 +22,7 @@ from scenarios import cli
 from scenarios.flight import FlightRecord
 from scenarios.limits import LIMIT_CYCLE_RAD_S, METRICS
 from scenarios.manoeuvres import KINDS, make_manoeuvre
+from scenarios.run_comparison import NEITHER, SENSES
 from scenarios.runner import RunOptions, run_scenario
 from scenarios.scenario import list_scenarios, load_scenario
 from scenarios.table import COLUMNS as TABLE
@@ -101,6 +102,14 @@ def test_every_command_and_option_is_in_the_contract() -> None:
         assert rows[name] == set(re.findall(r"--[a-z][a-z0-9-]+", page.getvalue())) - {"--help"}, name
     (names,) = (action.choices for action in cli._parser()._actions if action.dest == "command")
     assert set(rows) == set(names)
+
+
+def test_the_tolerances_of_a_comparison_are_those_of_the_code() -> None:
+    rows = [
+        [name, "–" if sense == NEITHER else sense, f"{tolerance:g} {METRICS[name][0]}".removesuffix(" 1")]
+        for name, (sense, tolerance) in SENSES.items()
+    ]
+    assert table("metric", "better") == rows
 
 
 FLOWN = [words for words in COMMANDS if words[0] == "fly" and any(name in " ".join(words) for name in FILES)]
