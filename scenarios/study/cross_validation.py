@@ -90,7 +90,8 @@ def fly_pairs_live(
         f"gains tuned on the scaled model, flown over MAVLink on the true one, profile {profile}",
         tuple(rows),
         "Target < reference; the study's own gains stand in tables 7.1 to 7.3, and what they do among the pairs of "
-        "chapter 7. An empty cell: not measurable, as in a limit cycle, or never settles.",
+        "chapter 7. Nothing in a cell: not measurable, as in a limit cycle, or never settles. The peak is that of the "
+        "telemetry, which can miss a spike of one tick in profile study.",
     )
 
 

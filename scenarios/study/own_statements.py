@@ -101,8 +101,13 @@ def _tuned(pairs: Sequence[Pair]) -> list[Conclusion]:
             bad = [(p, n) for p, n in lines if n.meets < 1.0]
             told = "; ".join(
                 f"{p.target} on {p.based_on}: {100 * n.meets:.1f} % of the samples, settling "
-                + ("not on all" if math.isnan(n.settling_s[1]) else f"{n.settling_s[1]:.2f} s")
-                + f", overshoot {n.overshoot_pct:.2f} %, delay margin {1e3 * n.delay_margin_s:.1f} ms"
+                + ("not measurable on all" if math.isnan(n.settling_s[1]) else f"{n.settling_s[1]:.2f} s")
+                + (
+                    ", overshoot not measurable on all"
+                    if math.isnan(n.overshoot_pct)
+                    else f", overshoot {n.overshoot_pct:.2f} %"
+                )
+                + f", delay margin {1e3 * n.delay_margin_s:.1f} ms"
                 for p, n in bad
             )
             on = "each airframe's own model" if itself else "the scaled models of the other airframes"

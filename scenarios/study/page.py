@@ -45,7 +45,7 @@ def _kinds(study: Study) -> list[dict[str, Any]]:
     for pair in study.pairs:
         n, g = line_of(pair), pair.gains
         title = f"{'Gains tuned here' if pair.source.startswith('tuned') else 'Printed gains'}, profile {pair.profile}"
-        cells = [pair.target, pair.based_on + (" (itself)" if pair.based_on == pair.target else "")]
+        cells = [pair.target, "itself" if pair.based_on == pair.target else pair.based_on]
         cells.append(number(100.0 * n.meets, 1))
         cells += [f"{value:.4g}" for value in (g.k_phi, g.kp, g.ki, g.kd)]
         cells += [number(n.settling_s[0], 3), number(n.settling_s[1], 3), number(n.overshoot_pct)]

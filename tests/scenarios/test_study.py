@@ -207,6 +207,16 @@ class TestOwnStatements:
         for target, based_on in close:
             assert f"{target} on {based_on}" in one.evidence.partition("At the limit")[2]
 
+    def test_what_was_not_measured_is_said_in_words(self, study: Study) -> None:
+        """The printed sets of profile sitl, most of which shake, given out for tuned ones."""
+        tuned = [replace(p, source="tuned for sitl") for p in study.pairs if p.profile == "sitl"]
+        told = [c for c in conclusions([*study.pairs, *tuned]) if c.statement.startswith("Gains tuned here")]
+        assert len(told) == 2
+        for one in told:
+            assert one.verdict is Verdict.REFUTED
+            assert "settling not measurable on all, overshoot not measurable on all, delay margin -" in one.evidence
+            assert "nan" not in one.evidence
+
     def test_overshoot_is_no_matter_of_what_it_is_measured_against(self, study: Study) -> None:
         told = [c for c in study.conclusions if "overshoots by" in c.statement]
         assert len(told) == 4
