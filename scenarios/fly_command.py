@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from scenarios.flight import RunRecord
     from scenarios.runner import Progress, RunResult
     from scenarios.scenario import Scenario
 
@@ -50,10 +51,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--arm-hardware", action="store_true", help="allow arming on a serial link: propellers may turn")
     add("--seed", type=int, metavar="N", help="of sensor noise")
     add("--jobs", type=int, default=1, metavar="N", help="flights at a time (default: 1)")
-    add("--live", action="store_true", help="serve a Rerun viewer on 127.0.0.1 while flying")
+    add("--live", action="store_true", help="watch the flight: opens the viewer, without a display serves 127.0.0.1")
     add("--out", type=Path, default=Path("logs"), metavar="DIR", help="where run folders go (logs)")
     add("--json", action="store_true", help="print run.json instead of the table")
     add("--junit", type=Path, metavar="FILE", help="also write JUnit XML here")
+    add("--markdown", type=Path, metavar="FILE", help="also write a short Markdown summary here, for a build's page")
     add("--gate", action="store_true", help="exit status 1 unless every set passes")
 
 
@@ -90,7 +92,8 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...] | None, seed: int 
     from scenarios.progress import RunWatch
     from scenarios.runner import RunOptions, run_scenario
 
-    _check_junit(args.junit)
+    for option, path in (("--junit", args.junit), ("--markdown", args.markdown)):
+        _check_place(option, path)
     scenario = _scenario(args, scaling, seed)
     options = RunOptions(
         out=args.out,
@@ -98,6 +101,7 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...] | None, seed: int 
         arm_hardware=args.arm_hardware,
         jobs=args.jobs,
         live_port=_live_port() if args.live else None,
+        live_window=args.live and _has_viewer(),
         command=("froude", *args.argv),
         hil=args.hil or "",
         px4=args.px4,
@@ -109,7 +113,8 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...] | None, seed: int 
 
     def begin() -> None:
         if options.live_port is not None:
-            tell(f"live view: rerun --connect rerun+http://127.0.0.1:{options.live_port}/proxy")
+            opened = "opening the viewer; one more" if options.live_window else "look on with"
+            tell(f"live view: {opened}: rerun --connect rerun+http://127.0.0.1:{options.live_port}/proxy")
         _tell_of_compiling(tell)
 
     watch = RunWatch(begin)
@@ -124,12 +129,12 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...] | None, seed: int 
         return _report(args, result, tell)
 
 
-def _check_junit(path: Path | None) -> None:
+def _check_place(option: str, path: Path | None) -> None:
     """Better now than after an hour of flying."""
     from sitl.errors import FileError
 
     if path is not None and not path.parent.is_dir():
-        raise FileError(path, "its folder does not exist", "Make the folder, or write --junit to another place")
+        raise FileError(path, "its folder does not exist", f"Make the folder, or write {option} to another place")
 
 
 def _report(args: argparse.Namespace, result: RunResult, tell: Tell) -> int:
@@ -148,11 +153,10 @@ def _report(args: argparse.Namespace, result: RunResult, tell: Tell) -> int:
         text = run_text(run, folder, width=width, colour=colour)
     unread = _show(text)
     stopped = result.stopped or unread
-    if args.junit is not None:
-        from scenarios.junit import write_junit
-
+    for write, path in ((_write_junit, args.junit), (_write_markdown, args.markdown)):
         try:
-            write_junit(run, args.junit)
+            if path is not None:
+                write(run, path)
         except FroudeError as error:
             stopped = stopped or error
     if stopped is not None:
@@ -164,6 +168,18 @@ def _report(args: argparse.Namespace, result: RunResult, tell: Tell) -> int:
     if args.gate and any(flight.outcome is not Outcome.PASS for flight in run.flights):
         return EXIT_GATE
     return EXIT_OK
+
+
+def _write_junit(run: RunRecord, path: Path) -> None:
+    from scenarios.junit import write_junit
+
+    write_junit(run, path)
+
+
+def _write_markdown(run: RunRecord, path: Path) -> None:
+    from scenarios.job_summary import write_job_summary
+
+    write_job_summary(run, path)
 
 
 def _show(text: str) -> Exception | None:
@@ -195,6 +211,12 @@ def _live_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+def _has_viewer() -> bool:
+    from scenarios.recorder.viewer import has_display
+
+    return has_display()
 
 
 def _progress_bar() -> AbstractContextManager[Callable[[Progress], object]]:

@@ -1,7 +1,7 @@
 """A run's folder: `run.json` and the files of its flights.
 
     <utc>_<scenario>_<vehicle>/
-        run.json  compare.rrd  junit.xml
+        run.json  compare.rrd  junit.xml  report.html
         flights/<gain set>.rrd .parquet .tlog .params .backup.params
         flights/<gain set>.own.rrd ...     the same gains with our own autopilot, beside a real one
 
