@@ -156,13 +156,16 @@ def _look(choice: Choice, args: argparse.Namespace, tell: Tell) -> int:
     if args.html:
         return _report(stored, args)
     recording = _recording(stored, args.flight or choice.slug, tell)
-    if args.screenshot is not None:
-        return _draw(recording, args, tell)
-    if args.web:
-        return _serve([recording], args, tell)
-    from scenarios.recorder.viewer import open_viewer
+    from scenarios.recorder.recording_end import whole_recording
 
-    open_viewer([recording])
+    with whole_recording(recording, keep=not (args.web or args.screenshot)) as whole:
+        if args.screenshot is not None:
+            return _draw(whole, args, tell)
+        if args.web:
+            return _serve([whole], args, tell)
+        from scenarios.recorder.viewer import open_viewer
+
+        open_viewer([whole])
     _print(f"Opened {recording}")
     return EXIT_OK
 

@@ -7,22 +7,17 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
-import tempfile
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from scenarios.recorder.recording_end import whole_recording
 from sitl.errors import FileError
 
 PROPERTIES = "/__properties"
 EVENTS = "/events"
-
-_CUT = re.compile(r"payload \(start (\d+), length \d+\) exceeds file size")
-_HEADER = 16
-"""Bytes in front of a message's payload."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +45,8 @@ def recorded_facts(rrd: Path) -> RecordedFacts:
         FileError: it cannot be read.
     """
     try:
-        with _silence():
-            return _read_whole_or_cut(rrd)
+        with whole_recording(rrd) as whole, _silence():
+            return _read(whole)
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
         raise _unreadable(rrd, error) from error
     except BaseException as error:
@@ -82,20 +77,6 @@ def _unreadable(rrd: Path, error: BaseException) -> FileError:
     # Rerun's text begins with a file's name, which stands in front already
     problem = (str(error).splitlines() or [type(error).__name__])[0].rpartition(f"{rrd.name}: ")[2]
     return FileError(rrd, f"cannot be read as a Rerun recording: {problem}", "Its .tlog has the same flight")
-
-
-def _read_whole_or_cut(rrd: Path) -> RecordedFacts:
-    """A message that was cut off makes the reader refuse the whole file, though not the viewer: leave it off."""
-    try:
-        return _read(rrd)
-    except RuntimeError as error:
-        cut = _CUT.search(str(error))
-        if cut is None:
-            raise
-        with tempfile.TemporaryDirectory(prefix="froude-") as folder:
-            whole = Path(folder) / rrd.name
-            whole.write_bytes(rrd.read_bytes()[: int(cut.group(1)) - _HEADER])
-            return _read(whole)
 
 
 def _read(rrd: Path) -> RecordedFacts:

@@ -35,7 +35,7 @@ def screenshot(rrd: Path, png: Path, at_s: float | None = None, tab: str | None 
         Errors and warnings that the viewer's views reported; empty if all is well.
 
     Raises:
-        FileError: no such recording, or the picture cannot be written.
+        FileError: no such recording, one that the viewer cannot show, or the picture cannot be written.
         UsageError: no such tab; or the viewer does not start, most likely for want of a Vulkan driver.
     """
     if not rrd.is_file():
@@ -44,6 +44,8 @@ def screenshot(rrd: Path, png: Path, at_s: float | None = None, tab: str | None 
         with headless() as viewer:
             viewer.open(str(rrd.resolve()))
             _wait_loaded(viewer)
+            if not viewer.get_state().views:
+                raise FileError(rrd, "the viewer shows nothing of it: damaged, or empty", "Draw another recording")
             if tab is not None:
                 _open_tab(viewer, tab)
             if at_s is not None:

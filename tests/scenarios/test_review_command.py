@@ -22,11 +22,13 @@ import pytest
 from scenarios import cli
 from scenarios.limits import METRICS
 from scenarios.recorder import viewer
+from scenarios.recorder.recorded_facts import recorded_facts
+from scenarios.recorder.recording_end import whole_bytes, whole_recording
 from scenarios.recorder.web_viewer import PAGE, WebViewer
 from scenarios.run_comparison import SENSES, compare
 from scenarios.run_reader import read_run
 from scenarios.runner import RunOptions, run_scenario
-from sitl.errors import UsageError
+from sitl.errors import FileError, UsageError
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 150.0
@@ -614,3 +616,44 @@ def test_a_run_that_was_killed_in_flight(
     assert "run.json is missing: the run was killed, or is still being flown" in err[0]
     assert any(f"flight {flight.name} was not finished" in line for line in err)
     assert review(stored.folder, stored.folder, "--gate", out=out)[0] == 0
+
+
+class TestCutRecordings:
+    """Cut off anywhere, a recording opens up to its last whole message."""
+
+    @pytest.fixture
+    def recording(self, runs: Path) -> bytes:
+        return (runs / OLD / "flights" / "2_2_ant-x.rrd").read_bytes()
+
+    @pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.999])
+    def test_what_is_whole_is_read(self, recording: bytes, tmp_path: Path, share: float) -> None:
+        path = tmp_path / "x.partial.rrd"
+        path.write_bytes(recording[: round(share * len(recording))])
+        assert recorded_facts(path).name == "2.2 ANT-X"
+        with whole_recording(path) as copy:
+            assert copy.stat().st_size == whole_bytes(path) < path.stat().st_size
+            assert recording.startswith(copy.read_bytes())
+        assert not copy.exists()
+        with whole_recording(path, keep=True) as copy:
+            pass
+        assert copy.exists()
+        shutil.rmtree(copy.parent)
+
+    def test_what_is_whole_is_not_copied(self, recording: bytes, tmp_path: Path) -> None:
+        path = tmp_path / "x.rrd"
+        for data in (recording, b"", b"something else"):
+            path.write_bytes(data)
+            with whole_recording(path) as same:
+                assert same == path
+        with pytest.raises(FileError, match="cannot be read"), whole_recording(tmp_path / "none.rrd"):
+            pass
+
+    @pytest.mark.parametrize("damage", [b"", b"?" * 400, b"RRF2" + bytes(500), b"RRF2" + b"\xff" * 500])
+    def test_what_is_no_recording_is_a_clear_line(
+        self, tmp_path: Path, damage: bytes, capfd: pytest.CaptureFixture[str]
+    ) -> None:
+        (tmp_path / "x.rrd").write_bytes(damage)
+        with pytest.raises(FileError, match="cannot be read as a Rerun recording") as error:
+            recorded_facts(tmp_path / "x.rrd")
+        assert "\n" not in str(error.value)
+        assert capfd.readouterr().err == ""  # the reader's own words about it
