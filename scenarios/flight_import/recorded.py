@@ -166,9 +166,14 @@ def record(
     t = attitude.t_s
     columns: dict[str, Any] = {"t_s": t}
     _put(columns, ("phi_rad", "theta_rad", "psi_rad"), attitude.values)
-    rates = signals.true_rates if signals.true_rates is not None else signals.rates
+    rates = _rates(signals)
     _held(columns, ("p_rad_s", "q_rad_s", "r_rad_s"), rates, t)
-    _held(columns, ("phi_true_rad", "theta_true_rad", "psi_true_rad"), signals.true_attitude, t)
+    if signals.true_attitude is not None and len(signals.true_attitude):
+        # logged more thinly than the estimate that it is compared with: held, it would be late, and the estimate wrong
+        true = signals.true_attitude
+        smooth = Series(true.t_s, np.unwrap(true.values, axis=0))
+        angles = (interpolated(smooth, t) + math.pi) % math.tau - math.pi
+        _put(columns, ("phi_true_rad", "theta_true_rad", "psi_true_rad"), angles)
     _held(columns, ("phi_sp_rad", "theta_sp_rad", "psi_sp_rad"), signals.setpoint, t)
     if signals.setpoint is not None and 0.0 < signals.setpoint.rate_hz < THIN_SETPOINT_HZ:
         # held, it would come half a period late throughout, and the vehicle would seem that much quicker
@@ -223,6 +228,14 @@ def _state(series: Series | None, t: FloatArray, missing: float) -> FloatArray:
         return np.full(len(t), missing)
     held = series.at(t, stale_s=None)[:, 0]
     return np.where(np.isfinite(held), held, missing)
+
+
+def _rates(signals: Signals) -> Series | None:
+    """The truth, where a simulator tells it as often as the vehicle tells its own measurement."""
+    true, measured = signals.true_rates, signals.rates
+    if true is None or (measured is not None and true.rate_hz < 0.8 * measured.rate_hz):
+        return measured
+    return true
 
 
 def _mode_late_s(state: Series | None) -> float:

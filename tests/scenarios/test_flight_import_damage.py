@@ -147,7 +147,7 @@ def test_a_truncated_log_gives_what_it_has(tmp_path: Path) -> None:
 WHOLE = {"ulg": small_ulog(6.0), "tlog": small_tlog()}
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     kind=st.sampled_from(sorted(WHOLE)),
     cut=st.floats(0.0, 1.0),

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
-from collections.abc import Callable
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -27,86 +27,102 @@ amplitude_deg = 10.0
 hold_s = 2.0
 return_s = 2.0
 """
+FLOWN = """
+import pytest
 
-Run = Callable[..., "subprocess.CompletedProcess[str]"]
+def test_good(froude):
+    flown = froude.fly("quick.toml", gains="gains.toml", seed=3, limits="practical", vehicle="ant-x", profile="sitl")
+    assert flown.passes()
+    assert flown.passes("good")
+    assert flown.flight("good").metric("rise_time_s").value < 0.4
+    assert flown.run.scenario.seed == 3
+    with pytest.raises(KeyError, match="no gain set 'bad'; there is good"):
+        flown.passes("bad")
+
+def test_wild(froude):
+    assert froude.fly("quick.toml", gains=["gains.toml", "wild.toml"]).passes()
+
+def test_analysed(froude):
+    assert froude.analyse(gains="gains.toml", samples=8).passes()
+    assert froude.analyse(gains="wild.toml", samples=8).passes()
+
+def test_mistakes(froude):
+    for keys, said in (
+        ({"scenario": "demmo"}, "no such scenario"),
+        ({"limits": "practicle"}, "no limit set"),
+        ({"px4": "px4"}, "holds no bin/px4 and etc"),
+    ):
+        with pytest.raises(Exception, match=said):
+            froude.fly(**keys)
+"""
+HEAVY = ("numpy", "numba", "pyarrow", "rerun", "scipy", "control", "pymavlink", "pyulog", "matplotlib", "rich")
+LIGHT = f"""
+import sys
+
+def test_nothing_is_loaded_for_a_test_that_does_not_fly():
+    assert not {{name.partition(".")[0] for name in sys.modules}} & set({HEAVY!r})
+    assert "scenarios.flight_checks" not in sys.modules
+
+def test_options(froude, request):
+    here = request.config.invocation_params.dir
+    assert froude.px4 == here / "px4"
+    assert froude.out == here / "runs"
+    assert froude.folder == request.path.parent
+"""
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Run:
-    """Runs pytest in a folder of a user's with files beside their test."""
-
-    def run(text: str, *options: str) -> subprocess.CompletedProcess[str]:
-        folder = tmp_path / "user"
-        folder.mkdir(exist_ok=True)
-        (folder / "test_gains.py").write_text(text, encoding="utf-8")
-        (folder / "gains.toml").write_text(GOOD, encoding="utf-8")
-        (folder / "wild.toml").write_text(BAD, encoding="utf-8")
-        (folder / "quick.toml").write_text(SCENARIO, encoding="utf-8")
-        installed = any(one.value == "scenarios.pytest_plugin" for one in entry_points(group="pytest11"))
-        plugin = () if installed else ("-p", "scenarios.pytest_plugin")
-        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error", *plugin, *options]
-        return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-
-    return run
+def run(folder: Path, text: str, *options: str) -> subprocess.CompletedProcess[str]:
+    """Run pytest in a folder of a user's, with files beside their tests."""
+    for name, content in (
+        ("test_gains.py", text),
+        ("gains.toml", GOOD),
+        ("wild.toml", BAD),
+        ("quick.toml", SCENARIO),
+    ):
+        (folder / name).write_text(content, encoding="utf-8")
+    installed = any(one.value == "scenarios.pytest_plugin" for one in entry_points(group="pytest11"))
+    plugin = () if installed else ("-p", "scenarios.pytest_plugin")
+    command = [sys.executable, "-m", "pytest", "-rA", "-p", "no:cacheprovider", "-W", "error", *plugin, *options]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
-def test_gains_that_fly_pass_and_the_run_is_kept_where_asked(run: Run, tmp_path: Path) -> None:
-    done = run(
-        "def test_mine(froude):\n"
-        "    flown = froude.fly('quick.toml', gains='gains.toml', seed=3)\n"
-        "    assert flown.passes()\n"
-        "    assert flown.flight('good').metric('rise_time_s').value < 0.4\n"
-        "    assert flown.run.scenario.seed == 3\n",
-        "--froude-out",
-        "runs",
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    (folder,) = (tmp_path / "user" / "runs").iterdir()
-    assert (folder / "run.json").is_file()
-
-
-def test_a_failure_shows_table_reasons_and_folder(run: Run) -> None:
-    done = run(
-        "def test_mine(froude):\n    assert froude.fly('quick.toml', gains=['gains.toml', 'wild.toml']).passes()\n"
-    )
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The folder and the output of a user's tests that fly."""
+    folder = tmp_path_factory.mktemp("user")
+    done = run(folder, FLOWN, "--froude-out", "runs")
     assert done.returncode == 1, done.stdout + done.stderr
-    assert "assert 1 of 2 gain sets pass (wild FAIL: limit cycle" in done.stdout
-    assert "gain set" in done.stdout
-    assert "Run folder: " in done.stdout
-    assert "limit cycle" in done.stdout.partition("- froude -")[2]
+    return folder, done.stdout
 
 
-def test_analyse_and_mistakes(run: Run) -> None:
-    done = run(
-        "import pytest\n"
-        "def test_margins(froude):\n"
-        "    assert not froude.analyse(gains='wild.toml', samples=8).passes()\n"
-        "    assert froude.analyse(gains='gains.toml', samples=8).passes()\n"
-        "def test_mistake(froude):\n"
-        "    with pytest.raises(Exception, match='no such scenario'):\n"
-        "        froude.fly('demmo')\n"
-        "    with pytest.raises(Exception, match='no limit set'):\n"
-        "        froude.fly(limits='practicle')\n"
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+def test_gains_that_fly_pass_and_what_is_asked_for_is_flown(flown: tuple[Path, str]) -> None:
+    assert "PASSED test_gains.py::test_good" in flown[1]
+    assert "PASSED test_gains.py::test_mistakes" in flown[1]
 
 
-def test_a_px4_that_is_none_is_told(run: Run) -> None:
-    done = run(
-        "def test_mine(froude):\n    assert froude.fly('quick.toml', gains='gains.toml').passes()\n",
-        "--froude-px4",
-        "px4",
-    )
-    assert done.returncode == 1
-    assert "holds no bin/px4 and etc" in done.stdout
+def test_runs_are_kept_where_asked(flown: tuple[Path, str]) -> None:
+    folders = list((flown[0] / "runs").iterdir())
+    assert len(folders) >= 2
+    assert all((folder / "run.json").is_file() for folder in folders)
 
 
-def test_it_costs_nothing_while_it_is_not_used(run: Run) -> None:
-    heavy = ("numpy", "numba", "pyarrow", "rerun", "scipy", "control", "pymavlink", "pyulog", "matplotlib", "rich")
-    done = run(
-        "import sys\n"
-        "def test_mine():\n"
-        f"    assert not {{name.partition('.')[0] for name in sys.modules}} & set({heavy!r})\n"
-        "    assert 'scenarios.flight_checks' not in sys.modules\n"
-    )
+def test_a_failure_shows_table_reasons_and_folder(flown: tuple[Path, str]) -> None:
+    folder, printed = flown
+    assert "assert 1 of 2 gain sets pass (wild FAIL: limit cycle" in printed
+    wild = printed.partition("_ test_wild _")[2].partition("_ test_analysed _")[0]
+    (table,) = re.findall(r"-+ froude -+\n(.*)", wild, re.DOTALL)
+    assert re.search(r"^good .* PASS$", table, re.MULTILINE)
+    assert re.search(r"^wild .* FAIL$", table, re.MULTILINE)
+    assert "wild: limit cycle" in table
+    assert f"Run folder: {folder / 'runs'}" in table
+
+
+def test_an_analysis_that_fails_shows_its_text(flown: tuple[Path, str]) -> None:
+    analysed = flown[1].partition("_ test_analysed _")[2]
+    assert "assert 0 of 1 gain sets pass (wild: nominal fails, 0 of 8 samples)" in analysed
+    assert analysed.count("- froude -") == 2
+
+
+def test_options_are_heeded_and_it_costs_nothing_while_it_is_not_used(tmp_path: Path) -> None:
+    done = run(tmp_path, LIGHT, "--froude-out", "runs", "--froude-px4", "px4")
     assert done.returncode == 0, done.stdout + done.stderr
