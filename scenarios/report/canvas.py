@@ -162,9 +162,15 @@ def line(style: Style, width: float = 1.4, alpha: float = 1.0) -> dict[str, Any]
     return {"color": INK[style.hue], "linewidth": width, "linestyle": dashes, "alpha": alpha}
 
 
-def emphasis(passed: bool) -> dict[str, float]:
-    """Width and cover of a line among others: what passes stands out."""
-    return {"width": 2.6} if passed else {"width": 1.0, "alpha": 0.75}
+def emphasis(passed: bool, among: int) -> dict[str, float]:
+    """Width and cover of a line among others: what passes stands out.
+
+    Args:
+        passed: every limit holds. among: so many lines; many that swing would hide everything.
+    """
+    if passed:
+        return {"width": 2.6}
+    return {"width": 1.0, "alpha": 0.75} if among <= 6 else {"width": 0.8, "alpha": 0.35}
 
 
 def _lean(svg: str, name: str) -> str:

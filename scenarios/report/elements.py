@@ -68,6 +68,11 @@ class Table:
     columns: Sequence[str]
     rows: Sequence[Line]
 
+    @property
+    def wordy(self) -> list[bool]:
+        """Which columns hold text."""
+        return [any(row.cells[k].words for row in self.rows) for k in range(len(self.columns))]
+
 
 @dataclass(frozen=True)
 class Figure:

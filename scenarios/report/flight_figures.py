@@ -46,7 +46,9 @@ def step_overlay(sets: Sequence[Drawn], figure: str) -> Drawing:
     panel = _step_panel(first.amplitude_deg, max(one.trace.duration_s for one in sets), 6.2, 3.4)
     with panel.drawn() as (axes,):
         for one in sorted(sets, key=lambda drawn: drawn.passed):
-            axes.plot(*_thinned(one.trace.t_s, one.trace.roll_deg), **line(one.style, **emphasis(one.passed)))
+            axes.plot(
+                *_thinned(one.trace.t_s, one.trace.roll_deg), **line(one.style, **emphasis(one.passed, len(sets)))
+            )
         svg = panel.svg(figure)
     names = ", ".join(f"{one.name} ({'passes' if one.passed else 'does not pass'})" for one in sets)
     return Drawing(
@@ -56,16 +58,19 @@ def step_overlay(sets: Sequence[Drawn], figure: str) -> Drawing:
     )
 
 
-def step_figure(trace: StepTrace, style: Style, name: str, figure: str) -> Drawing:
+def step_figure(trace: StepTrace, style: Style, name: str, figure: str, own: StepTrace | None = None) -> Drawing:
     """One step with rise, overshoot and settling marked.
 
     Args:
         trace: what was flown. style: of its line. name: of the gain set. figure: its name on the page.
+        own: the same with our own autopilot, where a real one flew.
     """
     panel = _step_panel(trace.amplitude_deg, trace.duration_s, 4.2, 2.6)
     size = trace.amplitude_deg
     notes = []
     with panel.drawn() as (axes,):
+        if own is not None:
+            axes.plot(*_thinned(own.t_s, own.roll_deg), color=INK["ink"], linewidth=0.9, linestyle=(0, (4, 2)))
         axes.plot(*_thinned(trace.t_s, trace.roll_deg), **line(style, 1.7))
         if trace.rise is not None:
             for time_s, level in zip(trace.rise, (0.1, 0.9), strict=True):
@@ -73,6 +78,8 @@ def step_figure(trace: StepTrace, style: Style, name: str, figure: str) -> Drawi
             axes.plot(trace.rise, [0.0, 0.0], color=INK["ink"], linewidth=2.2, solid_capstyle="butt")
             axes.text(trace.rise[0], -0.03 * size, "R", va="top", ha="left", fontsize=SMALL, fontweight="bold")
             notes.append(f"R rise {trace.metrics['rise_time_s']:.3f} s")
+        elif trace.metrics.get("overshoot_pct") is not None:
+            notes += _wrapped(f"R {trace.reasons.get('rise_time_s') or 'not measured'}")
         overshoot = trace.metrics.get("overshoot_pct")
         if overshoot is not None:
             notes.append(f"O overshoot {number(overshoot, 1)} %")
@@ -83,7 +90,7 @@ def step_figure(trace: StepTrace, style: Style, name: str, figure: str) -> Drawi
             settled_s = trace.metrics.get(metric)
             if settled_s is None:
                 if metric in trace.metrics:
-                    notes.append(f"{sign} never settles in {100 * BAND[metric]:g} %" if trace.rise else "")
+                    notes.append(f"{sign} never settles in {100 * BAND[metric]:g} %" if notes else "")
                 continue
             axes.axvline(settled_s, ymin=0.0, color=INK["ink"], linewidth=0.9, linestyle=(0, (3, 2)))
             beside_s = settled_s + 0.01 * trace.duration_s

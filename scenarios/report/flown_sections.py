@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from scenarios.gain_set import load_gain_sets
 from scenarios.markdown import ROLL_GAINS
+from scenarios.report.canvas import Drawing
 from scenarios.report.elements import UNSET, Cell, Figure, Line, Section, Set, Sets, Table, heading, metric_cell
 from scenarios.report.flight_figures import Drawn, step_figure, step_overlay, track_figure
 from scenarios.report.verdict import limits_of, title
-from scenarios.report.windows import MARKED, segments_of, step_trace, track_trace
+from scenarios.report.windows import MARKED, StepTrace, segments_of, step_trace, track_trace
 from sitl.errors import FroudeError
 
 if TYPE_CHECKING:
@@ -72,7 +73,9 @@ def _blanks(sets: Sets, names: Sequence[str], segment: str = "") -> list[str]:
         blank: dict[str, list[str]] = {}
         for name in names:
             metric = one.flight.metric(name, segment)
-            if metric is not None and metric["value"] is None and metric["reason"]:
+            # what the verdict says already is not said twice; of a segment alone it is
+            told = not segment and metric is not None and metric["reason"] in one.data["reason"]
+            if metric is not None and metric["value"] is None and metric["reason"] and not told:
                 blank.setdefault(metric["reason"], []).append(title(name))
         for reason, columns in blank.items():
             reasons.setdefault((reason, ", ".join(columns)), []).append(one.name)
@@ -98,11 +101,17 @@ def step_sections(sets: Sets, telemetry: Telemetries) -> list[Section]:
             made.append(Section(f"step-{place}", _heading("Step response", name, names), _nothing_recorded()))
             continue
         overlay = step_overlay([Drawn(one.name, one.style, one.passed, trace) for one, trace in drawn], f"steps{place}")
-        wide = [Figure(f"steps-{place}", "All gain sets", overlay.svg, overlay.label, caption="Thick: passes.")]
+        caption = "Thick: passes."
+        wide = [Figure(f"steps-{place}", "All gain sets", overlay.svg, overlay.label, caption=caption)]
+        if len(drawn) == 1:
+            wide = []  # the one is shown alone anyway
         grid = []
+        owns = _own_traces(sets, name)
         for one, trace in drawn:
-            figure = step_figure(trace, one.style, one.name, f"step{place}-{one.number}")
-            grid.append(_figure(f"step-{place}-{one.number}", one, figure))
+            own = owns.get(one.flight.name)
+            figure = step_figure(trace, one.style, one.name, f"step{place}-{one.number}", own)
+            beside = "" if own is None else "Dashed and thin: our own autopilot with the same gains."
+            grid.append(_figure(f"step-{place}-{one.number}", one, figure, beside))
         columns = (*MARKED, "droop_deg", "peak_delta_lat", "oscillation_rad_s")
         shown = [name_ for name_ in columns if any(one.flight.metric(name_, name) for one in sets.all)]
         table = Table(
@@ -162,8 +171,19 @@ def _nothing_recorded() -> list[str]:
     return ["Nothing of it can be drawn: no telemetry of it is on disk."]
 
 
-def _figure(name: str, one: Set, drawing: Any) -> Figure:
-    return Figure(name, one.name, drawing.svg, drawing.label, one.style, one.outcome)
+def _own_traces(sets: Sets, segment: str) -> dict[str, StepTrace]:
+    """Of our own autopilot, where a real one flew."""
+    found = {}
+    for own in sets.run.owns:
+        rows = sets.run.telemetry(own)
+        trace = None if rows is None else step_trace(own.data, rows, segment)
+        if trace is not None:
+            found[own.name] = trace
+    return found
+
+
+def _figure(name: str, one: Set, drawing: Drawing, caption: str = "") -> Figure:
+    return Figure(name, one.name, drawing.svg, drawing.label, one.style, one.outcome, caption)
 
 
 def parameters_section(sets: Sets) -> Section:

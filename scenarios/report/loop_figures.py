@@ -141,7 +141,7 @@ def sensitivity_figure(loops: Sequence[DrawnLoop], figure: str) -> Drawing:
         axes.set_ylabel("|S| [dB]")
         for one in stable:
             level_db = 20.0 * np.log10(one.curves.sensitivity)
-            axes.plot(one.curves.hz, level_db, **line(one.style, **emphasis(one.passed)))
+            axes.plot(one.curves.hz, level_db, **line(one.style, **emphasis(one.passed, len(stable))))
             k = int(np.argmax(level_db))
             axes.plot([one.curves.hz[k]], [level_db[k]], marker="o", markersize=4, color=INK[one.style.hue])
         svg = panel.svg(figure)

@@ -63,7 +63,8 @@ class Verdict:
 
     Attributes:
         headline: in one sentence. choice: which of several that pass, and why; empty for none or one.
-        judged: those that pass first. ground: whether the airframe's own flight gains fly here; empty if not known.
+        judged: those that pass first. ground: whether the airframe's own flight gains fly here, and whether a real
+            autopilot flew; empty if not known.
         doubts: what speaks against the verdicts, a sentence each.
     """
 
@@ -102,7 +103,9 @@ def verdict_of(data: Object, shares: Sequence[tuple[int, int] | None] = ()) -> V
         for one in passing
         if one.doubtful and one.share is not None
     ]
-    doubts += _twins(data["twins"])
+    told, apart = _twins(data["twins"])
+    ground = f"{ground} {told}".strip()
+    doubts += apart
     if not data["complete"]:
         doubts.append("The run was interrupted; gain sets that are not listed were not flown")
     headline = _headline(data, judged, passing, bool(wrong))
@@ -169,11 +172,14 @@ def _ground(own: Object | None) -> tuple[str, str]:
     return f"{text}.", f"{text}: doubt the assumptions before the candidates"
 
 
-def _twins(twins: Sequence[Object]) -> list[str]:
+def _twins(twins: Sequence[Object]) -> tuple[str, list[str]]:
+    """That a real autopilot flew, and the doubts that follow."""
+    if not twins:
+        return "", []
     apart = [twin["gain_set"] for twin in twins if not twin["agree"]]
-    if not apart:
-        return []
-    return [f"The real autopilot and our own differ by more than is tolerated with {', '.join(apart)}"]
+    agree = f"our own agrees with it in {len(twins) - len(apart)} of {len(twins)} flights"
+    doubt = f"The real autopilot and our own differ by more than is tolerated with {', '.join(apart)}"
+    return f"A real autopilot flew this plant; {agree}.", [doubt] if apart else []
 
 
 def limits_of(data: Object) -> dict[str, str]:
