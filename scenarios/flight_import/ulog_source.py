@@ -34,7 +34,9 @@ TOPICS: Final = (
     "vehicle_land_detected",
     "actuator_motors",
     "actuator_outputs",
+    "actuator_controls_0",
 )
+"""The last one, and rates in vehicle_attitude, are those of a PX4 before 1.13 and 1.10."""
 _ARMED_STATE = 2
 _FIXED_WING, _ROVER = 2, 3
 _READ_FACTOR = 40
@@ -90,7 +92,8 @@ def read_ulog(path: Path, *, rotors: tuple[Rotor, ...] = ()) -> Recorded:
     armed = _series(log, "vehicle_status", ("arming_state",))
     signals = Signals(
         attitude=_angles(attitude),
-        rates=_series(log, "vehicle_angular_velocity", ("xyz[0]", "xyz[1]", "xyz[2]")),
+        rates=_series(log, "vehicle_angular_velocity", ("xyz[0]", "xyz[1]", "xyz[2]"))
+        or _series(log, "vehicle_attitude", ("rollspeed", "pitchspeed", "yawspeed")),
         true_attitude=None if true_attitude is None else _angles(true_attitude),
         true_rates=_series(log, "vehicle_angular_velocity_groundtruth", ("xyz[0]", "xyz[1]", "xyz[2]")),
         setpoint=None if setpoint is None else _angles(setpoint),
@@ -98,7 +101,8 @@ def read_ulog(path: Path, *, rotors: tuple[Rotor, ...] = ()) -> Recorded:
         thrust=None if thrust is None else Series(thrust.t_s, -thrust.values),
         position=_series(log, "vehicle_local_position", ("x", "y", "z", "vx", "vy", "vz")),
         motors=_motors(log, notes),
-        torque=_series(log, "vehicle_torque_setpoint", ("xyz[0]", "xyz[1]")),
+        torque=_series(log, "vehicle_torque_setpoint", ("xyz[0]", "xyz[1]"))
+        or _series(log, "actuator_controls_0", ("control[0]", "control[1]")),
         state=_series(log, "vehicle_status", ("nav_state",)),
         armed=None if armed is None else Series(armed.t_s, (armed.values == _ARMED_STATE).astype(np.float64)),
         landed=_series(log, "vehicle_land_detected", ("landed",)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import struct
 from functools import cache
 from pathlib import Path
@@ -26,6 +27,8 @@ from scenarios.manoeuvres import make_manoeuvre
 from scenarios.one_flight import FlightJob, fly
 from scenarios.run_reader import read_run
 from scenarios.twin import OWN_SUFFIX
+from sitl.modes import Mode, Result
+from sitl.setpoints import Sticks
 
 SETTLES_S = 0.025
 """A log shows a step's set-point a tick after it was sent, and at most one of its own periods after that."""
@@ -154,7 +157,7 @@ def test_without_a_vehicle_nothing_is_guessed(steps: Flown) -> None:
     (flight,) = run.flights
     assert not flight.margins
     assert run.twins == ()
-    assert "derivatives" not in run.vehicle
+    assert not run.vehicle["derivatives"]
     assert flight.outcome is Outcome.INFO
     assert value(flight, "peak_delta_lat") is None
     assert any("CA_ROTOR" in text for text in flight.warnings)
@@ -211,6 +214,47 @@ def test_too_little_excitation_is_refused_with_numbers(quick_job: Any, tmp_path:
     assert not (tmp_path / "runs").exists()
     with pytest.raises(Exception, match=r"largest step in roll 1\.2 deg over the flight; 3 deg are needed"):
         imported(flown.ulog)
+
+
+# -- by sticks ---------------------------------------------------------------------------------------------------------
+
+
+def test_steps_of_sticks_quick_and_rate_limited(flight: Any, tmp_path: Path) -> None:
+    """A pilot's steps in Stabilized and in Altitude; the second one's stick takes 150 ms to its place."""
+    flown = flight("ant-x")
+    flown.parameters.set("SDLOG_PROFILE", 17)
+    log = UlogWriter(tmp_path, flown.vehicle)
+    stick = [0.0]
+
+    def each(k: int) -> None:
+        log.tick()
+        if not k % 5:
+            flown.autopilot.manual.take(flown.vehicle.time_us, 0, Sticks(roll=stick[0]))
+
+    flown.take_off(settle_s=1.0)
+    begun = []
+    for mode, ramp_ticks in ((Mode.STABILIZED, 1), (Mode.ALTCTL, 37)):
+        flown.autopilot.manual.take(flown.vehicle.time_us, 0, Sticks())
+        assert flown.autopilot.command_mode(mode) is Result.ACCEPTED
+        flown.run(1.0, each)
+        begun.append(flown.time_s)
+        for k in range(ramp_ticks):
+            stick[0] = 0.3 * (k + 1) / ramp_ticks
+            flown.run(0.004, each)
+        flown.run(2.5, each)
+        stick[0] = 0.0
+        flown.run(2.5, each)
+        assert flown.autopilot.command_mode(Mode.LOITER) is Result.ACCEPTED
+        flown.run(6.0, each)
+    log.close()
+    (path,) = tmp_path.rglob("*.ulg")
+    found = find(read_ulog(path))
+    assert [one.kind for one in found.segments] == ["step", "hold", "step", "hold"]
+    quick, _, slewed, _ = found.segments
+    assert quick.start_s == pytest.approx(begun[0], abs=0.03)
+    assert slewed.start_s == pytest.approx(begun[1] + 0.075, abs=0.04)
+    (note,) = found.notes
+    assert re.search(r"step_2/1: the set-point took 1[0-9]{2} ms, less than the vehicle's rise", note)
 
 
 # -- several systems, MAVLink 1, restarts ------------------------------------------------------------------------------

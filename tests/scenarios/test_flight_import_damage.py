@@ -127,6 +127,29 @@ def test_what_the_small_logs_show_is_found(tmp_path: Path) -> None:
         assert segment.start_s == pytest.approx(4.0, abs=0.021)
 
 
+def test_topics_of_an_older_px4(tmp_path: Path) -> None:
+    """Rates were in vehicle_attitude, and torques in actuator_controls_0."""
+    attitude = Layout(
+        "vehicle_attitude", "uint64_t timestamp;float[4] q;float rollspeed;float pitchspeed;float yawspeed"
+    )
+    controls = Layout("actuator_controls_0", "uint64_t timestamp;uint64_t timestamp_sample;float[8] control")
+    parts = [ulog.header(0), ulog.flag_bits()]
+    parts += [one.definition() for one in (attitude, controls, STATUS)]
+    parts += [ulog.subscription(n, one.topic) for n, one in enumerate((attitude, controls, STATUS))]
+    for k in range(100):
+        stamp = 1_000_000 + 10_000 * k
+        parts.append(attitude.pack(0, (stamp, *quat(1.0), 0.5, 0.0, 0.0)))
+        parts.append(controls.pack(1, (stamp, 0, 0.25, *[0.0] * 7)))
+        parts.append(STATUS.pack(2, (stamp, ARMED, OFFBOARD, MULTIROTOR)))
+    path = tmp_path / "old.ulg"
+    path.write_bytes(b"".join(parts))
+    telemetry = read_ulog(path).telemetry
+    assert telemetry["p_rad_s"][-1] == 0.5
+    assert telemetry["delta_lat"][-1] == 0.25
+    with pytest.raises(FileError, match=r"has no roll set-point \(vehicle_attitude_setpoint\)"):
+        accepted(read_ulog(path), find(read_ulog(path)))
+
+
 def test_a_quick_ramp_is_a_step_from_its_half_and_a_slow_one_is_none(tmp_path: Path) -> None:
     path = tmp_path / "ramp.ulg"
     path.write_bytes(small_ulog(ramp_s=0.2))
