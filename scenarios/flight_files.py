@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Any, Self
 from bridge.tlog import TlogWriter
 from scenarios.flight import FlightRecord
 from scenarios.gain_set import save_params
-from sitl.airframe import Rotor
 from sitl.errors import FileError, FroudeError
 from sitl.parameters import ParameterTable
 
 if TYPE_CHECKING:
     from scenarios.recorder import FlightRecorder
+    from scenarios.recorder.flight_drawing import FlownVehicle
+    from scenarios.recorder.link_lines import LinkCounts
     from scenarios.sampler import Columns
 
 
@@ -31,8 +32,10 @@ class FlightFiles:
         folder: where the files go; it exists.
         slug: the gain set's name as a file name; all files are called so.
         name: of the recording in the viewer.
-        rotors: of the airframe, to draw it.
+        vehicle: what flies, to draw it.
         live_port: port that serves viewers while flying; None for none.
+        live_window: open a viewer's window on it.
+        rows_per_chunk: telemetry rows that are written together; None for the recorder's own choice.
 
     Attributes:
         problem: the first file that could not be written; None while all is well.
@@ -47,21 +50,30 @@ class FlightFiles:
         slug: str,
         *,
         name: str,
-        rotors: tuple[Rotor, ...],
+        vehicle: FlownVehicle,
         live_port: int | None = None,
+        live_window: bool = False,
         rows_per_chunk: int | None = None,
     ) -> None:
-        from scenarios.recorder import FlightRecorder
+        from scenarios.recorder import FlightRecorder, live
+        from scenarios.recorder.flight_recorder import ROWS_PER_CHUNK
+        from scenarios.recorder.link_lines import LinkCounts
 
         self.problem: FroudeError | None = None
         self._base = folder / slug
+        self._counts = LinkCounts()
+        self.about: Mapping[str, Any] = {}
+        """Facts on the run, name -> number or text, for the recording's properties."""
+        self.counts: Callable[[], LinkCounts] | None = None
+        """What the link has counted so far; looked at with every batch of rows."""
+        feed = None if live_port is None else live.feed(live_port, window=live_window)
         self._recorder: FlightRecorder = FlightRecorder(
             self.path(".rrd"),
             name=name,
             recording_id=f"{folder.parent.name}-{slug}",
-            rotors=rotors,
-            live_port=live_port,
-            rows_per_chunk=rows_per_chunk,
+            vehicle=vehicle,
+            feed=feed,
+            rows_per_chunk=rows_per_chunk or ROWS_PER_CHUNK,
         )
         try:
             self._tlog = TlogWriter(self.path(".partial.tlog"))
@@ -95,6 +107,12 @@ class FlightFiles:
         """Record finished rows of telemetry."""
         if self.problem is None:
             self._attempt(lambda: self._recorder.append(batch))
+            self._count(float(batch["t_s"][-1]))
+
+    def _count(self, t_s: float) -> None:
+        if self.counts is not None:
+            self._counts = self.counts()
+            self._attempt(lambda: self._recorder.link(t_s, self._counts))
 
     def event(self, t_s: float, severity: int, text: str) -> None:
         """Record a text and its MAV_SEVERITY."""
@@ -112,7 +130,8 @@ class FlightFiles:
     def finish(self, record: FlightRecord) -> None:
         """Write what is left of a flight and give the files their names; failures are in `problem`."""
         from scenarios.markdown import flight_page
-        from scenarios.recorder.comparison import flight_properties
+        from scenarios.recorder.flight_properties import flight_properties
+        from scenarios.recorder.link_lines import link_figures, link_page
 
         streamed = self.problem is None
         if len(record.telemetry):
@@ -122,7 +141,10 @@ class FlightFiles:
             self._recorder.segment(segment)
         if streamed:
             self._attempt(self._finish_log)
-            self._attempt(lambda: self._recorder.close(flight_page(record), flight_properties(record)))
+            figures = link_figures(self._counts, record.telemetry, record.segments)
+            properties = {**flight_properties(record), "run": self.about, "link": figures}
+            page = link_page(figures, record.timing)
+            self._attempt(lambda: self._recorder.close(flight_page(record), properties, page))
 
     def _finish_log(self) -> None:
         self._tlog.close()

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from scenarios import sampler
 from scenarios.gain_set import GainSet
@@ -14,7 +15,12 @@ from sitl.profile import Profile
 from sitl.vehicle import airframe_parameters
 from sitl.vehicle_spec import VehicleModel
 
+if TYPE_CHECKING:
+    from scenarios.recorder.flight_drawing import FlownVehicle
+
 MEMORY = "memory://"
+
+TELEMETRY_HZ = round(1e6 / sampler.FAST_INTERVAL_US)
 
 
 @dataclass(frozen=True)
@@ -28,7 +34,7 @@ class FlightJob:
         warnings: of the gain set's check.
         folder: where the flight's files go; None keeps nothing.
         connect: link URL of a vehicle, or memory:// for one of our own.
-        live_port: port for viewers, None for none.
+        live_port: port for viewers, None for none. live_window: open a viewer's window, too.
         patience_s: wall-clock silence after which a vehicle elsewhere counts as lost, s.
         command: as typed, for who restores what a flight has left.
         suffix: behind the gain set's file name, for a flight that is kept beside another of the same set.
@@ -46,6 +52,7 @@ class FlightJob:
     patience_s: float = 5.0
     command: tuple[str, ...] = ()
     suffix: str = ""
+    live_window: bool = False
 
     @property
     def slug(self) -> str:
@@ -60,12 +67,36 @@ class FlightJob:
                 table.set(name, value)
         return table
 
+    def flown_vehicle(self) -> FlownVehicle:
+        """What a recording draws: the body, and the control loop's settings at the rate that telemetry has at most."""
+        from scenarios.recorder.flight_drawing import FlownVehicle
+        from sitl.control_settings import control_settings, mix_of
+
+        airframe, table = self.model.airframe, self.flown_table()
+        profile = replace(self.profile, rate_hz=min(self.profile.rate_hz, TELEMETRY_HZ))
+        return FlownVehicle(airframe.rotors, airframe.frame_m, control_settings(table, profile, mix_of(table)))
+
+    def about(self) -> dict[str, float | int | str]:
+        """Facts on the run that each of its recordings carries."""
+        return {
+            "scenario": self.scenario.name,
+            "vehicle": self.model.spec,
+            "profile": self.profile.name,
+            "gain_set": self.gain_set.name,
+            "autopilot": "own" if self.in_memory else "real, or elsewhere",
+            "seed": self.scenario.seed,
+            "folder": "" if self.folder is None else self.folder.parent.name,
+        }
+
+    @property
+    def rows_per_chunk(self) -> int:
+        """Telemetry rows that are written together: fewer over a link that may die."""
+        return sampler.ROWS_PER_BATCH if self.in_memory else 250
+
     @property
     def rows_per_batch(self) -> int:
-        """Telemetry rows that are written together: few for eyes that watch or a link that may die, else many."""
-        if self.live_port is not None:
-            return 50
-        return sampler.ROWS_PER_BATCH if self.in_memory else 250
+        """Telemetry rows that are handed over together: few for eyes that watch in real time."""
+        return 50 if self.live_port is not None and not self.in_memory else self.rows_per_chunk
 
     @property
     def in_memory(self) -> bool:

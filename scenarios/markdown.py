@@ -107,10 +107,38 @@ def flight_page(flight: FlightRecord) -> str:
     return "\n\n".join(parts) + "\n"
 
 
+MARGINS = (
+    ("gain_margin_low_db", "gain margin, less [dB]"),
+    ("gain_margin_high_db", "gain margin, more [dB]"),
+    ("phase_margin_deg", "phase margin [deg]"),
+    ("delay_margin_s", "delay margin [s]"),
+    ("modulus_margin", "modulus margin [-]"),
+)
+
+
+def margins_and_gains(flights: Sequence[FlightRecord]) -> str:
+    """Margins of the roll loop, and the parameters of each gain set, one row each."""
+    names = _parameter_names(flights)
+    rows = [
+        [
+            flight.gain_set.name,
+            *(UNSET if flight.margins.get(key) is None else f"{flight.margins[key]:.3g}" for key, _ in MARGINS),
+            *(_gain(flight.gain_set.parameters.get(name)) for name in names),
+        ]
+        for flight in flights
+    ]
+    return markdown_table(("gain set", *(title for _, title in MARGINS), *names), rows)
+
+
+def _parameter_names(flights: Sequence[FlightRecord]) -> list[str]:
+    """Of all gain sets, those of roll first."""
+    names = list(dict.fromkeys(name for flight in flights for name in flight.gain_set.parameters))
+    return sorted(names, key=lambda name: (ROLL_GAINS.index(name) if name in ROLL_GAINS else len(ROLL_GAINS), name))
+
+
 def gains_table(flights: Sequence[FlightRecord]) -> str:
     """Parameters of each flight's gain set, one row each."""
-    names = list(dict.fromkeys(name for flight in flights for name in flight.gain_set.parameters))
-    names.sort(key=lambda name: (ROLL_GAINS.index(name) if name in ROLL_GAINS else len(ROLL_GAINS), name))
+    names = _parameter_names(flights)
     rows = [[name, *(_gain(flight.gain_set.parameters.get(name)) for flight in flights)] for name in names]
     return markdown_table(("parameter", *(flight.gain_set.name for flight in flights)), rows)
 

@@ -148,11 +148,13 @@ class _Flight:
                     job.folder,
                     job.slug,
                     name=job.gain_set.name,
-                    rotors=job.model.airframe.rotors,
+                    vehicle=job.flown_vehicle(),
                     live_port=job.live_port,
-                    rows_per_chunk=job.rows_per_batch,
+                    live_window=job.live_window,
+                    rows_per_chunk=job.rows_per_chunk,
                 )
             )
+            self._files.about = job.about()
         client = self._open_client()
         _spare_the_collector()
         client.on_text = self._on_text
@@ -218,6 +220,10 @@ class _Flight:
             self._stack.callback(link.close)
         files = self._files
         client = Client(link, drive, log=files.frame if files else None)
+        if files is not None:
+            from scenarios.recorder.link_lines import LinkCounts
+
+            files.counts = lambda: LinkCounts.of(client.connection.counters)
         inverse = mix_of(job.flown_table()).inverse[:2]
         self._sampler = Sampler(client, inverse, files.rows if files else None, rows_per_batch=job.rows_per_batch)
         if session is not None:

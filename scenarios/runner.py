@@ -45,7 +45,7 @@ class RunOptions:
         connect: link URL of the vehicle, memory:// for our own.
         arm_hardware: a serial link may be armed.
         jobs: flights at a time; more than one only for vehicles of our own.
-        live_port: port that serves viewers while flying; None for none.
+        live_port: port that serves viewers while flying; None for none. live_window: open a viewer's window on it.
         command: as typed, for run.json.
         hil: simulator link on which a real autopilot flies our plant, `tcpin://127.0.0.1:4560`, or the serial port of
             a board; empty for none.
@@ -60,6 +60,7 @@ class RunOptions:
     arm_hardware: bool = False
     jobs: int = 1
     live_port: int | None = None
+    live_window: bool = False
     command: tuple[str, ...] = ()
     hil: str = ""
     px4: Path | None = None
@@ -171,6 +172,7 @@ def _run_scenario(
                 **job.parameters,
             },
             live_port=options.live_port,
+            live_window=options.live_window,
             command=options.command,
         )
         for job in planned

@@ -77,7 +77,8 @@ def write_flight(record: FlightRecord, folder: Path, rotors: Sequence[Rotor]) ->
     from scenarios.gain_set import save_params
     from scenarios.markdown import flight_page
     from scenarios.recorder import FlightRecorder
-    from scenarios.recorder.comparison import flight_properties
+    from scenarios.recorder.flight_drawing import FlownVehicle
+    from scenarios.recorder.flight_properties import flight_properties
 
     slug = record.gain_set.slug
     about = {"gain_set": record.gain_set.name, "vehicle": record.vehicle_spec}
@@ -88,7 +89,7 @@ def write_flight(record: FlightRecord, folder: Path, rotors: Sequence[Rotor]) ->
         folder / f"{slug}.rrd",
         name=record.gain_set.name,
         recording_id=f"{folder.parent.name}-{slug}",
-        rotors=rotors or PICTURE,
+        vehicle=FlownVehicle(rotors or PICTURE),
     ) as recorder:
         recorder.append(record.telemetry.columns)
         for event in record.events:

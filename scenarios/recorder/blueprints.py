@@ -36,6 +36,7 @@ RANKS: Mapping[str, float] = {"oscillates": 1.0, "failed": 1.5, "passed": 2.0, "
 
 SETPOINT: Colour = (235, 235, 235)
 LIMIT: Colour = (150, 150, 150)
+TRUTH: Colour = (90, 110, 60)
 TWIN_WIDTH = 1.0
 """Line width of our own autopilot's response, drawn on top of a real one's."""
 MEASURED: Colour = PALETTE[0]
@@ -116,14 +117,28 @@ def roll_range_deg(
     return low - margin, high + margin
 
 
-def _series(
+def wide_range(*values: NDArray[np.float64]) -> tuple[float, float] | None:
+    """An axis with some room for all of them; None if nothing is known or all is the same.
+
+    Args:
+        values: of the lines; NaN where unknown.
+    """
+    known = np.concatenate([one[np.isfinite(one)] for one in values])
+    if not known.size or known.max() <= known.min():
+        return None
+    room = 0.08 * float(known.max() - known.min())
+    return float(known.min()) - room, float(known.max()) + room
+
+
+def series(
     name: str,
     entity: str | Sequence[str],
     page: Page | None = None,
     y: tuple[float, float] | None = None,
     legend: bool = True,
+    right: bool = True,
 ) -> Any:
-    """A plot of one or several entities over the page's time."""
+    """A plot of one or several entities over the page's time; the left, where a step begins, is no place for names."""
     import rerun.blueprint as rrb
 
     return rrb.TimeSeriesView(
@@ -132,7 +147,7 @@ def _series(
         contents=[entity] if isinstance(entity, str) else list(entity),
         axis_x=_time_axis(page),
         axis_y=None if y is None else rrb.ScalarAxis(range=y),
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop if right else rrb.Corner2D.LeftTop, visible=legend),
     )
 
 
@@ -153,7 +168,9 @@ def _time_axis(page: Page | None) -> Any:
 def _lanes(page: Page | None = None) -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.StateTimelineView(name="Flight mode and manoeuvre", origin="/state", time_view=_time_axis(page))
+    return rrb.StateTimelineView(
+        name="Manoeuvre, flight mode, motors at a limit", origin="/state", time_view=_time_axis(page)
+    )
 
 
 def _events() -> Any:
@@ -164,7 +181,7 @@ def _events() -> Any:
     return rrb.TextLogView(name="Events", origin="/events", columns=rrb.TextLogColumns(text_log_columns=columns))
 
 
-def _blueprint(tabs: Sequence[Any], first: Page | None) -> Any:
+def tabbed(tabs: Sequence[Any], first: Page | None) -> Any:
     """Tabs with every panel out of the way, and the time cursor at the first page."""
     import rerun.blueprint as rrb
     from rerun.encodings import AbsoluteTimeRange
@@ -198,24 +215,27 @@ def flight_blueprint(pages: Sequence[Page], whole: Page | None) -> Any:
     """
     tabs = [_manoeuvre(page) for page in pages]
     first = pages[0] if pages else None
-    return _blueprint([*tabs, _whole_flight(whole), _space(first or whole)], first)
+    return tabbed([*tabs, _whole_flight(whole), _space(first or whole), _link(whole)], first)
 
 
 def _manoeuvre(page: Page) -> Any:
     import rerun.blueprint as rrb
 
     plots = rrb.Vertical(
-        _series("Roll angle [deg]", "/roll", page, page.roll_deg),
-        _series("Roll rate p [rad/s]", "/roll_rate", page),
-        _series(
-            f"Roll torque delta_lat [-]; the motors can give {page.delta_lat_room or 1.0:.2f}",
-            "/delta_lat",
-            page,
-            page.delta_lat,
+        series("Roll angle [deg]", "/roll", page, page.roll_deg),
+        series("Roll rate p [rad/s]", "/roll_rate", page),
+        series("Terms of the roll rate loop [-], reconstructed", "/roll_rate_terms", page),
+        rrb.Horizontal(
+            series(
+                f"Roll torque delta_lat [-]; the motors can give {page.delta_lat_room or 1.0:.2f}",
+                "/delta_lat",
+                page,
+                page.delta_lat,
+            ),
+            series("Motor commands [0..1]", "/motors", page, (-0.03, 1.03)),
         ),
-        _series("Motor commands [0..1]", "/motors", page, (-0.03, 1.03)),
         _lanes(page),
-        row_shares=[4.0, 3.0, 2.5, 2.5, 2.0],
+        row_shares=[3.6, 2.4, 3.2, 2.6, 2.3],
     )
     return rrb.Horizontal(plots, _verdict_and_events(), column_shares=[2.4, 1.0], name=page.name)
 
@@ -224,11 +244,15 @@ def _whole_flight(page: Page | None) -> Any:
     import rerun.blueprint as rrb
 
     plots = rrb.Vertical(
-        _series("Roll angle [deg]", "/roll", page),
-        _series("Pitch angle [deg]", "/pitch", page),
-        _series("Body rates p, q, r [rad/s]", ("/roll_rate", "/pitch_rate", "/yaw_rate"), page),
-        _series("Motor commands [0..1]", "/motors", page, (-0.03, 1.03)),
-        _series("Position [m]", "/position", page),
+        series("Roll angle [deg]", "/roll", page),
+        rrb.Horizontal(series("Pitch angle [deg]", "/pitch", page), series("Heading [deg]", "/heading", page)),
+        rrb.Horizontal(
+            series("Roll rate p [rad/s]", "/roll_rate", page, legend=False),
+            series("Pitch rate q [rad/s]", "/pitch_rate", page, legend=False),
+            series("Yaw rate r [rad/s]", "/yaw_rate", page, legend=False),
+        ),
+        series("Motor commands [0..1]", "/motors", page, (-0.03, 1.03)),
+        rrb.Horizontal(series("Position [m]", "/position", page), series("Velocity [m/s]", "/velocity", page)),
         _lanes(page),
         row_shares=[2.5, 2.0, 2.5, 2.0, 2.5, 2.0],
     )
@@ -254,43 +278,22 @@ def _space(page: Page | None) -> Any:
         ),
     )
     plots = rrb.Vertical(
-        _series("Roll angle [deg]", "/roll", page),
-        _series("Motor commands [0..1]", "/motors", page, (-0.03, 1.03)),
+        series("Roll angle [deg]", "/roll", page),
+        series("Motor commands [0..1]", "/motors", page, (-0.03, 1.03)),
         _lanes(page),
         row_shares=[3.0, 3.0, 1.5],
     )
     return rrb.Horizontal(view, plots, column_shares=[1.6, 1.0], name="3D")
 
 
-def compare_blueprint(pages: Sequence[tuple[str, Page]], twins: bool = False) -> Any:
-    """Layout of a comparison: a tab per manoeuvre, every candidate above the table; then the circumstances.
-
-    Args:
-        pages: (entity prefix, page) of each manoeuvre; the page's time counts from the manoeuvre's start.
-        twins: there is a document on two autopilots, `/twins`.
-    """
+def _link(page: Page | None) -> Any:
     import rerun.blueprint as rrb
 
-    def lower(name: str, quantity: str, prefix: str, page: Page, y: tuple[float, float] | None) -> Any:
-        # The colours are those of the plot above, whose legend is enough.
-        return _series(name, f"{prefix}/{quantity}/**", page, y, legend=False)
-
-    tabs = [
-        rrb.Vertical(
-            _series(f"{page.name}: roll angle [deg]", f"{prefix}/roll/**", page, page.roll_deg),
-            rrb.Horizontal(
-                lower("Roll error: set-point minus roll [deg]", "error", prefix, page, page.error_deg)
-                if page.tracking
-                else lower("Roll rate p [rad/s]", "roll_rate", prefix, page, page.rate_rad_s),
-                lower("Roll torque delta_lat [-]", "delta_lat", prefix, page, page.delta_lat),
-            ),
-            rrb.TextDocumentView(name="Verdicts", origin="/summary"),
-            row_shares=[3.0, 1.7, 2.3],
-            name=page.name,
-        )
-        for prefix, page in pages
-    ]
-    if twins:
-        tabs.append(rrb.TextDocumentView(name="Real and own autopilot", origin="/twins"))
-    tabs.append(rrb.TextDocumentView(name="Vehicle, assumptions, gains", origin="/circumstances"))
-    return _blueprint(tabs, pages[0][1] if pages else None)
+    plots = rrb.Vertical(
+        series("Time between two rows of telemetry [ms]", "/link/interval", page),
+        series("Messages lost, late, damaged since the link was opened", "/link/messages", page, right=False),
+        _lanes(page),
+        row_shares=[2.0, 2.0, 1.5],
+    )
+    page_ = rrb.TextDocumentView(name="Link", origin="/link_page")
+    return rrb.Horizontal(plots, page_, column_shares=[2.0, 1.0], name="Link")

@@ -21,6 +21,10 @@ PLACE = "/world/place"
 BODY = PLACE + "/body"
 GROUND_M = 30
 """Half the side of the drawn ground, squares of 1 m."""
+ROTOR_DIAGONALS = 0.2
+"""Radius of a rotor, in diagonals of the frame: an airframe's file has no propellers. Less where they would touch."""
+BODY_SHARE = 0.3
+"""Drawn length and width of the body without arms, in those of the frame."""
 ARROW_DIAGONALS = 0.7
 """Length of a full-thrust arrow, in diagonals of the frame."""
 
@@ -45,9 +49,16 @@ class BodyView:
         recording: where to.
         rotors: at least one, in motor order.
         colours: one per motor, the same as in the motors' plot.
+        frame_m: length, width, height of the body, m; zeros if not known.
     """
 
-    def __init__(self, recording: Recording, rotors: Sequence[RotorPlace], colours: Sequence[Colour]) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        rotors: Sequence[RotorPlace],
+        colours: Sequence[Colour],
+        frame_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
         import rerun as rr
 
         self._recording = recording
@@ -72,12 +83,18 @@ class BodyView:
             f"{BODY}/rotors",
             rr.Cylinders3D(
                 lengths=[0.02 * diagonal] * len(hubs),
-                radii=[0.2 * diagonal] * len(hubs),
+                radii=[rotor_radius(hubs, diagonal)] * len(hubs),
                 centers=hubs,
+                labels=[f"{n + 1}" for n in range(len(hubs))],
+                show_labels=True,
                 colors=list(colours),
                 fill_mode="solid",
             ),
         )
+        if min(frame_m) > 0.0:
+            # as wide as the arms leave room for: the frame's own length and width reach to the motors
+            half = [0.5 * frame_m[0] * BODY_SHARE, 0.5 * frame_m[1] * BODY_SHARE, 0.25 * frame_m[2]]
+            recording.log(f"{BODY}/frame", rr.Boxes3D(half_sizes=[half], colors=[(105, 105, 105)], fill_mode="solid"))
         recording.log(
             f"{BODY}/front",
             rr.Arrows3D(
@@ -119,6 +136,19 @@ class BodyView:
         self._corners.extend(enu_m[::PATH_STRIDE])
         path = rr.LineStrips3D([np.array(self._corners)], colors=[(86, 180, 233)], radii=[-1.5])
         recording.log("/world/path", path, float(time_s[0]))
+
+
+def rotor_radius(hubs: NDArray[np.float64], diagonal_m: float) -> float:
+    """Radius to draw rotors with, m: neighbours beside each other do not touch; those above each other do not count.
+
+    Args:
+        hubs: (n, 3) places. diagonal_m: of the frame.
+    """
+    apart = np.hypot(*(hubs[:, None, :2] - hubs[None, :, :2]).transpose(2, 0, 1))
+    beside = apart[apart > 0.05 * diagonal_m]
+    return (
+        float(min(ROTOR_DIAGONALS * diagonal_m, 0.47 * beside.min())) if beside.size else ROTOR_DIAGONALS * diagonal_m
+    )
 
 
 def enu_quaternions(phi: NDArray[Any], theta: NDArray[Any], psi: NDArray[Any]) -> NDArray[np.float64]:

@@ -1,21 +1,32 @@
-"""A server of our own that viewers look at while something is flown: `rerun --connect <its address>`.
+"""A live view beside a flight: another process, told what happens and never waited for.
 
-One server per process and port, kept until the process ends: Rerun's holds its port for as long as a viewer
-is connected, so a server per flight could not start for the second one.
+What a flight has to tell goes into a file without a name, which the other process reads at its own pace and draws for
+whoever looks on (`live_viewer`). So nothing that happens to a viewer, frozen, slow, killed or never there, reaches the
+flight: not its pace, not its memory, not its files.
+
+One such process per flying process and port. It lives until all is drawn after the flying process has ended.
 """
 
 from __future__ import annotations
 
+import atexit
+import os
+import pickle
 import socket
-from typing import Any
+import struct
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any, Final
 
 from sitl.errors import UsageError
 
-HOST = "127.0.0.1"
-MEMORY = "256MB"
-"""What is kept for a viewer that joins late; the oldest is dropped first."""
+HOST: Final = "127.0.0.1"
+LENGTH: Final = struct.Struct("<I")
+"""Before each message: how long it is."""
 
-_servers: dict[int, Any] = {}
+_feeds: dict[int, LiveFeed] = {}
 
 
 def address(port: int) -> str:
@@ -23,26 +34,72 @@ def address(port: int) -> str:
     return f"rerun+http://{HOST}:{port}/proxy"
 
 
-def serve(port: int) -> str:
-    """Start the server unless this process has it already; only this machine can reach it.
+class LiveFeed:
+    """The flying process's end.
 
     Args:
-        port: TCP port of 127.0.0.1.
+        port: of 127.0.0.1, where viewers look on.
+        window: open a viewer's window, too.
 
-    Returns:
-        Its address.
+    Raises:
+        UsageError: the port is taken, or there is no room for temporary files.
+    """
+
+    def __init__(self, port: int, *, window: bool = False) -> None:
+        _check_free(port)
+        try:
+            handle, self._path = tempfile.mkstemp(prefix="froude-live-")
+        except OSError as error:
+            raise UsageError(f"live view: no temporary file: {error.strerror or error}") from error
+        self._spool = os.fdopen(handle, "wb", buffering=0)
+        words = [self._path, str(port), str(os.getpid()), *(("window",) if window else ())]
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "scenarios.recorder.live_viewer", *words],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C is for the flight
+        )
+        self._lost = False
+        atexit.register(self.close)
+
+    def tell(self, what: str, *about: Any) -> None:
+        """Tell of something; returns at once, whatever has become of the view.
+
+        Args:
+            what: a method of `live_viewer.LiveView`. about: its arguments, plain data.
+        """
+        if self._lost:
+            return
+        message = pickle.dumps((what, *about), protocol=pickle.HIGHEST_PROTOCOL)
+        try:
+            # nobody reads it any more: do not fill the disk
+            self._lost = self.process.poll() is not None
+            if not self._lost:
+                self._spool.write(LENGTH.pack(len(message)) + message)
+        except OSError:
+            self._lost = True  # a full disk ends the view, not the flight
+
+    def close(self) -> None:
+        """Nothing more will be told."""
+        self._lost = True
+        self._spool.close()
+        if self.process.poll() is not None:  # else the file is its own to remove
+            Path(self._path).unlink(missing_ok=True)
+
+
+def feed(port: int, *, window: bool = False) -> LiveFeed:
+    """The feed of this process, begun by the first call.
+
+    Args:
+        port: of 127.0.0.1. window: open a viewer's window with the first call.
 
     Raises:
         UsageError: the port is taken.
     """
-    import rerun as rr
-
-    if port not in _servers:
-        _check_free(port)
-        stream = rr.RecordingStream("froude-live", send_properties=False)
-        stream.set_sinks(rr.GrpcServerSink(HOST, port, server_memory_limit=MEMORY))
-        _servers[port] = stream
-    return address(port)
+    if port not in _feeds or _feeds[port].process.poll() is not None:
+        _feeds[port] = LiveFeed(port, window=window)
+    return _feeds[port]
 
 
 def _check_free(port: int) -> None:

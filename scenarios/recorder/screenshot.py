@@ -11,9 +11,13 @@ import threading
 from pathlib import Path
 from typing import Any
 
+from scenarios.recorder.blueprints import BEFORE_S
 from scenarios.recorder.stream import TIMELINE
 from scenarios.recorder.viewer import headless
 from sitl.errors import FileError, UsageError
+
+INTO_S = 0.1
+"""Where a step is on its way."""
 
 _PAUSE_S = 0.3
 _LOAD_ATTEMPTS = 100
@@ -28,7 +32,8 @@ def screenshot(rrd: Path, png: Path, at_s: float | None = None, tab: str | None 
     Args:
         rrd: the recording.
         png: the picture, 1920 x 1080; replaced if it exists.
-        at_s: where the time cursor stands, s on the recording's timeline; None: where the viewer puts it.
+        at_s: where the time cursor stands, s on the recording's timeline; None: a moment into the first
+            manoeuvre.
         tab: title of the tab to open; None: the layout's own choice.
 
     Returns:
@@ -50,6 +55,8 @@ def screenshot(rrd: Path, png: Path, at_s: float | None = None, tab: str | None 
                 _open_tab(viewer, tab)
             if at_s is not None:
                 viewer.set_time(TIMELINE, duration=at_s, play_state="paused")
+            else:
+                to_first_manoeuvre(viewer)
             image = _still_frame(viewer)
             reports = [f"{view.name}: {report}" for view in viewer.get_state().views for report in view.reports]
     except (RuntimeError, OSError, ValueError) as error:
@@ -64,6 +71,23 @@ def screenshot(rrd: Path, png: Path, at_s: float | None = None, tab: str | None 
     except OSError as error:
         raise FileError(png, f"cannot be written: {error}", "Choose another file") from error
     return reports
+
+
+def to_first_manoeuvre(viewer: Any) -> None:
+    """Put the time cursor where the first manoeuvre has begun: a layout can select it, but not put the cursor there.
+
+    Args:
+        viewer: Rerun's `ViewerClient`, the recording loaded.
+    """
+    panels = (part.get("TimePanelBlueprint", {}) for part in viewer.get_blueprint().blueprint.values())
+    selections = [selection for panel in panels if (selection := panel.get("time_selection"))]
+    if selections:
+        start_s = _start_ns(selections[0]) * 1e-9 + BEFORE_S
+        viewer.set_time(TIMELINE, duration=start_s + INTO_S, play_state="paused")
+
+
+def _start_ns(selection: Any) -> int:
+    return int(selection["min"] if isinstance(selection, dict) else selection[0])
 
 
 def _wait_loaded(viewer: Any) -> None:

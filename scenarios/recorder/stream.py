@@ -1,8 +1,7 @@
 """One Rerun file being written: opening, lines, lanes, texts, and the move to its final name.
 
-The file is the record of truth, so a viewer is never allowed to hold it up: the live view is a stream of its
-own, into our own server. One stream with both a file and a `GrpcSink` stalls the file as soon as the receiver
-is slow or gone.
+The file is the record of truth, so no viewer is allowed near it: one stream with both a file and a `GrpcSink` stalls
+the file as soon as the receiver is slow or gone. Who looks on is served by another process (`live`).
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenarios.recorder import live
 from sitl.errors import FileError
 
 Colour = tuple[int, ...]
@@ -29,67 +27,38 @@ LEAST_FREE_BYTES = 16_000_000
 LEAST_LEFT_BYTES = 100_000
 FLUSH_PATIENCE_S = 30.0
 ABANDON_PATIENCE_S = 2.0
-LIVE_PATIENCE_S = 2.0
 _FOOTER = b"FOOT"
 """Ends the last bytes of a file that was finished."""
 
 
 class Recording:
-    """A `.rrd` file under construction, called `<name>.partial.rrd` until `finish`.
+    """Writes into one of Rerun's streams.
 
     Args:
-        path: the finished file.
-        application_id: the viewer keeps one layout per application id.
-        recording_id: unique among the recordings that are opened together.
+        stream: a `RecordingStream` whose sink is set.
         name: as the viewer lists it.
-        live_port: also show it to the viewers of `live.serve(live_port)`.
-
-    Raises:
-        FileError: the file cannot be created, or the disk is nearly full.
-        UsageError: the port is taken.
     """
 
-    def __init__(
-        self, path: Path, *, application_id: str, recording_id: str, name: str, live_port: int | None = None
-    ) -> None:
+    def __init__(self, stream: Any, name: str) -> None:
         import rerun as rr
 
-        self.path = path
-        self.partial = path.with_name(path.stem + ".partial.rrd")
         rr.set_strict_mode(True)  # otherwise a wrong argument is a line on stderr and a hole in the file
-        _check_space(path)
-        self._file = rr.RecordingStream(application_id, recording_id=recording_id)
-        self._live: Any = None
-        if live_port is not None:
-            uri = live.serve(live_port)
-            self._live = rr.RecordingStream(application_id, recording_id=recording_id)
-            self._live.set_sinks(rr.GrpcSink(uri))
-        try:
-            self._file.set_sinks(rr.FileSink(str(self.partial)))
-        except RuntimeError as error:
-            raise FileError(path, f"cannot be written: {error}", "Choose another folder with --out") from error
-        for stream in self._streams:
-            stream.set_log_time_enabled(False)
-            stream.set_log_tick_enabled(False)
-            stream.send_recording_name(name)
-
-    @property
-    def _streams(self) -> tuple[Any, ...]:
-        return (self._file,) if self._live is None else (self._file, self._live)
+        self.stream = stream
+        stream.set_log_time_enabled(False)
+        stream.set_log_tick_enabled(False)
+        stream.send_recording_name(name)
 
     def log(self, entity: str, thing: Any, time_s: float | None = None) -> None:
         """Log one of Rerun's archetypes, at a time or (None) for always."""
-        for stream in self._streams:
-            if time_s is not None:
-                stream.set_time(TIMELINE, duration=time_s)
-            stream.log(entity, thing, static=time_s is None)
+        if time_s is not None:
+            self.stream.set_time(TIMELINE, duration=time_s)
+        self.stream.log(entity, thing, static=time_s is None)
 
     def columns(self, entity: str, time_s: NDArray[np.float64], columns: Any) -> None:
         """Send many rows of Rerun's component columns; time_s is (n,)."""
         import rerun as rr
 
-        for stream in self._streams:
-            stream.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=time_s)], columns)
+        self.stream.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=time_s)], columns)
 
     def style(
         self,
@@ -135,9 +104,30 @@ class Recording:
 
     def lane(self, entity: str, time_s: float, state: str) -> None:
         """The entity's state from this moment; empty ends the state before."""
+        self.lanes(entity, np.array([time_s]), [state])
+
+    def lanes(self, entity: str, time_s: NDArray[np.float64], states: Sequence[str]) -> None:
+        """Many states of an entity, each from its moment on; time_s is (n,)."""
         import rerun as rr
 
-        self.log(entity, rr.StateChange(state=state), time_s)
+        self.columns(entity, time_s, rr.StateChange.columns(state=list(states)))
+
+    def band(self, entity: str, name: str, colour: Colour) -> None:
+        """Name and colour of a filled band; see `between`."""
+        import rerun as rr
+
+        # the line in the middle of it is of no interest
+        style = rr.Measurements.from_fields(names=[name], colors=[colour], widths=[0.0])
+        self.log(entity, style)
+
+    def between(
+        self, entity: str, time_s: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
+    ) -> None:
+        """Edges of a filled band, (n,) each: the viewer fills one standard deviation around a value."""
+        import rerun as rr
+
+        half = 0.5 * (high - low)
+        self.columns(entity, time_s, rr.Measurements.columns(values=0.5 * (high + low), variances=half * half))
 
     def text(self, entity: str, time_s: float, level: str, text: str) -> None:
         """A line of a log."""
@@ -161,13 +151,39 @@ class Recording:
                 for name, value in values.items()
                 if value is not None and not (isinstance(value, float) and math.isnan(value))
             }
-            for stream in self._streams if known else ():
-                stream.send_property(group, rr.AnyValues(**known))
+            if known:
+                self.stream.send_property(group, rr.AnyValues(**known))
 
     def layout(self, blueprint: Any) -> None:
         """The layout that the viewer opens with; the last one counts."""
-        for stream in self._streams:
-            stream.send_blueprint(blueprint)
+        self.stream.send_blueprint(blueprint)
+
+
+class FileRecording(Recording):
+    """A `.rrd` file under construction, called `<name>.partial.rrd` until `finish`.
+
+    Args:
+        path: the finished file.
+        application_id: the viewer keeps one layout per application id.
+        recording_id: unique among the recordings that are opened together.
+        name: as the viewer lists it.
+
+    Raises:
+        FileError: the file cannot be created, or the disk is nearly full.
+    """
+
+    def __init__(self, path: Path, *, application_id: str, recording_id: str, name: str) -> None:
+        import rerun as rr
+
+        self.path = path
+        self.partial = path.with_name(path.stem + ".partial.rrd")
+        _check_space(path)
+        stream = rr.RecordingStream(application_id, recording_id=recording_id)
+        try:
+            stream.set_sinks(rr.FileSink(str(self.partial)))
+        except RuntimeError as error:
+            raise FileError(path, f"cannot be written: {error}", "Choose another folder with --out") from error
+        super().__init__(stream, name)
 
     def finish(self) -> Path:
         """Write everything and give the file its name.
@@ -177,7 +193,7 @@ class Recording:
         """
         try:
             _check_space(self.path, LEAST_LEFT_BYTES)
-            self._file.flush(timeout_sec=FLUSH_PATIENCE_S)
+            self.stream.flush(timeout_sec=FLUSH_PATIENCE_S)
             self._let_go()
             with self.partial.open("rb") as file:
                 file.seek(-64, 2)
@@ -193,32 +209,21 @@ class Recording:
                 f"could not be finished: {problem}",
                 f"Free some space; what was flown is in {self.partial}",
             ) from error
-        finally:
-            self._close_live()
         return self.path
 
     def abandon(self) -> None:
         """Stop: the partial file keeps what was written and opens in the viewer."""
         self._let_go()
-        self._close_live()
 
     def _let_go(self) -> None:
         """Rerun's writer may die of a full disk on the way, and then nobody answers: wait for a while only."""
         import rerun as rr
 
-        closing = threading.Thread(target=self._file.disconnect, daemon=True)
+        closing = threading.Thread(target=self.stream.disconnect, daemon=True)
         closing.start()
         closing.join(ABANDON_PATIENCE_S)
         if closing.is_alive():
             rr.unregister_shutdown()  # which would wait for the same writer when the program ends
-
-    def _close_live(self) -> None:
-        """A viewer that hangs would hold this up for half a minute: leave it to finish by itself."""
-        if self._live is not None:
-            closing = threading.Thread(target=self._live.disconnect, daemon=True)
-            closing.start()
-            closing.join(LIVE_PATIENCE_S)
-            self._live = None
 
 
 def _check_space(path: Path, least_bytes: int = LEAST_FREE_BYTES) -> None:

@@ -1,7 +1,6 @@
 import ctypes.util
 import dataclasses
 import math
-import socket
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -11,18 +10,22 @@ import pytest
 
 from scenarios.limits import Outcome
 from scenarios.markdown import flight_page
+from scenarios.one_flight import fly
 from scenarios.recorder import FlightRecorder
 from scenarios.recorder.blueprints import PALETTE, RANKS, candidate_colour, roll_range_deg
-from scenarios.recorder.body import enu_quaternions
-from scenarios.recorder.comparison import best_flight, flight_properties, record_compare
-from scenarios.recorder.flight_recorder import mode_name, roll_extremes, roll_room
+from scenarios.recorder.body import enu_quaternions, rotor_radius
+from scenarios.recorder.comparison import best_flight, record_compare
+from scenarios.recorder.flight_drawing import FlownVehicle
+from scenarios.recorder.flight_plots import mode_name, roll_extremes, roll_room, saturation
+from scenarios.recorder.flight_properties import flight_properties
 from scenarios.recorder.screenshot import screenshot
+from scenarios.recorder.spread import spreads
 from sitl.actuators import RotorEffect, allocate, normalised_mix
 from sitl.airframe import load_airframe
-from sitl.errors import FileError, UsageError
+from sitl.errors import FileError
 
 DEG = 180.0 / math.pi
-ROTORS = load_airframe("ant-x").rotors
+VEHICLE = FlownVehicle(load_airframe("ant-x").rotors)
 
 
 class Read:
@@ -59,7 +62,9 @@ class Read:
 
 
 def record(path, flight, **keys):
-    recorder = FlightRecorder(path, name=flight.gain_set.name, recording_id=flight.gain_set.slug, rotors=ROTORS, **keys)
+    recorder = FlightRecorder(
+        path, name=flight.gain_set.name, recording_id=flight.gain_set.slug, vehicle=VEHICLE, **keys
+    )
     rows = len(flight.telemetry)
     for first in range(0, rows, 250):
         recorder.append({name: values[first : first + 250] for name, values in flight.telemetry.columns.items()})
@@ -92,8 +97,8 @@ class TestFlight:
     def test_every_row_is_there_in_shown_units(self, recorded, flight):
         times, values = recorded.lines("/roll")
         assert np.allclose(times, flight.telemetry["t_s"], atol=1e-9)
-        assert np.allclose(values[:, 0], flight.telemetry["phi_sp_rad"] * DEG, atol=1e-5)
-        assert np.allclose(values[:, 1], flight.telemetry["phi_rad"] * DEG, atol=1e-5)
+        for line, column in enumerate(("phi_true_rad", "phi_sp_rad", "phi_rad")):
+            assert np.allclose(values[:, line], flight.telemetry[column] * DEG, atol=1e-5, equal_nan=True)
         _, motors = recorded.lines("/motors")
         assert np.allclose(motors[:, 3], flight.telemetry["motor4"])
         _, position = recorded.lines("/position")
@@ -141,6 +146,64 @@ class TestFlight:
         last = {name: float(flight.telemetry[name][-1]) for name in ("east_m", "north_m", "down_m")}
         assert np.allclose(places[-1][0], [last["east_m"], last["north_m"], -last["down_m"]], atol=1e-6)
 
+    def test_terms_add_up_to_the_torque_of_the_motors(self, quick_job, tmp_path):
+        job = quick_job(overrides={"gyro_noise_rad_s": 0.0, "gyro_quantum_rad_s": 0.0}, job={"folder": tmp_path})
+        flown = fly(job)
+        times, terms = Read(tmp_path / "set.rrd").lines("/roll_rate_terms")
+        measured = flown.telemetry.between(flown.segments[0].start_s, flown.segments[-1].end_s - 0.002)
+        rows = np.searchsorted(times, measured["t_s"] - 1e-6)
+        assert np.allclose(times[rows], measured["t_s"], atol=1e-9)
+        assert np.allclose(terms[rows, 4], measured["delta_lat"], atol=1e-6)
+        assert np.allclose(terms[rows, :4].sum(axis=1), terms[rows, 4], atol=1e-12)
+        assert np.ptp(terms[rows, 1]) > 0.01, "the integrator moves"
+
+    def test_terms_with_noise_are_near_the_torque(self, quick_job, tmp_path):
+        flown = fly(quick_job(job={"folder": tmp_path}))
+        times, terms = Read(tmp_path / "set.rrd").lines("/roll_rate_terms")
+        measured = flown.telemetry.between(flown.segments[0].start_s, flown.segments[-1].end_s - 0.002)
+        rows = np.searchsorted(times, measured["t_s"] - 1e-6)
+        assert np.std(terms[rows, 4] - measured["delta_lat"]) < 0.05 * np.std(measured["delta_lat"])
+
+    def test_the_link_is_counted_and_told(self, quick_job, tmp_path):
+        flown = fly(quick_job(job={"folder": tmp_path}))
+        read = Read(tmp_path / "set.rrd")
+        _, interval = read.lines("/link/interval")
+        assert np.allclose(interval[1:, 0], 1e3 * np.diff(flown.telemetry["t_s"]), atol=1e-6)
+        assert np.all(read.lines("/link/messages")[1] == 0)
+        assert read.column("/__properties/link", "messages_lost")[1] == [[0]]
+        assert read.column("/__properties/link", "telemetry_rate_hz")[1][0][0] == pytest.approx(250.0)
+        assert read.column("/__properties/run", "vehicle")[1] == [["ant-x"]]
+        assert read.text("/link_page").startswith("# Link")
+
+    def test_margins_are_properties(self, recorded):
+        assert recorded.column("/__properties/margins", "delay_margin_s")[1] == [[0.03]]
+        assert len(recorded.chunks["/__properties/margins"]) == 1, "what is infinite is left out"
+
+
+def test_saturation_is_told_by_the_motors_that_are_at_a_limit():
+    time = np.arange(10) * 0.02
+    motors = np.full((10, 2), 0.5)
+    motors[2:4, 1] = 1.0
+    motors[5, 0] = 0.0
+    motors[9, 0] = 0.0
+    assert saturation(time, motors) == [
+        (0.0, ""),
+        (0.04, "motor 1, 2 at a limit"),
+        (pytest.approx(0.12), ""),
+        (pytest.approx(0.18), "motor 1 at a limit"),
+    ]
+    assert saturation(time, np.full((10, 2), np.nan)) == [(0.0, "")]
+    assert saturation(time[:0], motors[:0]) == []
+
+
+@pytest.mark.parametrize("name", ["ant-x", "ant-r", "carrier-1", "adam-0"])
+def test_rotors_are_drawn_apart(name):
+    airframe = load_airframe(name)
+    hubs = np.array([(r.px_m, -r.py_m, -r.pz_m) for r in airframe.rotors])
+    radius = rotor_radius(hubs, airframe.diagonal_m)
+    apart = [np.hypot(*(a - b)[:2]) for n, a in enumerate(hubs) for b in hubs[n + 1 :]]
+    assert 0.0 < 2.0 * radius < min(apart)
+
 
 class TestUnfinished:
     def test_an_abandoned_flight_keeps_what_was_flown(self, flight, tmp_path):
@@ -158,9 +221,10 @@ class TestUnfinished:
 import numpy as np, os, pathlib, threading
 from scenarios.recorder import FlightRecorder
 from scenarios.telemetry import Telemetry
+from scenarios.recorder.flight_drawing import FlownVehicle
 from sitl.airframe import load_airframe
 recorder = FlightRecorder(pathlib.Path({str(tmp_path / "k.rrd")!r}), name="k", recording_id="k",
-                          rotors=load_airframe("ant-x").rotors)
+                          vehicle=FlownVehicle(load_airframe("ant-x").rotors))
 for k in range(3):
     recorder.append(Telemetry.from_columns({{"t_s": k * 2.0 + np.arange(500) / 250.0}}).columns)
 threading.Event().wait(1.0)
@@ -185,12 +249,12 @@ os._exit(9)
 class TestErrors:
     def test_a_folder_that_is_not_there(self, tmp_path):
         with pytest.raises(FileError, match=r"a\.rrd.*cannot be written.*--out"):
-            FlightRecorder(tmp_path / "gone" / "a.rrd", name="a", recording_id="a", rotors=ROTORS)
+            FlightRecorder(tmp_path / "gone" / "a.rrd", name="a", recording_id="a", vehicle=VEHICLE)
 
     def test_a_full_disk_is_said_before_the_flight(self, tmp_path, monkeypatch):
         monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1_000_000))
         with pytest.raises(FileError, match=r"1\.0 MB are free"):
-            FlightRecorder(tmp_path / "a.rrd", name="a", recording_id="a", rotors=ROTORS)
+            FlightRecorder(tmp_path / "a.rrd", name="a", recording_id="a", vehicle=VEHICLE)
 
     def test_a_disk_that_fills_up_in_flight_keeps_the_partial_file(self, flight, tmp_path, monkeypatch):
         recorder = record(tmp_path / "a.rrd", flight)
@@ -204,22 +268,9 @@ class TestErrors:
         assert not (tmp_path / "a.rrd").exists()
         assert (tmp_path / "a.partial.rrd").exists()
 
-    def test_a_taken_live_port_is_named(self, tmp_path):
-        with socket.socket() as other:
-            other.bind(("127.0.0.1", 0))
-            other.listen()
-            port = other.getsockname()[1]
-            with pytest.raises(UsageError, match=f"port {port} of 127.0.0.1.*choose another port"):
-                FlightRecorder(tmp_path / "a.rrd", name="a", recording_id="a", rotors=ROTORS, live_port=port)
 
-    def test_a_live_port_serves_one_flight_after_the_other_on_loopback(self, flight, tmp_path):
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
-        for number in range(2):
-            record(tmp_path / f"{number}.rrd", flight, live_port=port).close()
-            assert len(Read(tmp_path / f"{number}.rrd").lines("/roll")[0]) == len(flight.telemetry)
-            socket.create_connection(("127.0.0.1", port), timeout=5).close()
+def renamed(flight, name):
+    return dataclasses.replace(flight, gain_set=dataclasses.replace(flight.gain_set, name=name))
 
 
 class TestCompare:
@@ -260,6 +311,39 @@ class TestCompare:
         assert not any("refused" in entity for entity in compared.chunks if not entity.startswith("/__prop"))
         assert "arming refused" in compared.text("/summary")
         assert compared.column("/__properties/refused_verdict", "outcome")[1] == [["FAIL"]]
+
+    def test_the_winner_is_said_first_and_is_a_property(self, compared):
+        assert compared.text("/summary").startswith("## Best: own gains")
+        assert compared.column("/__properties/run", "best")[1] == [["own gains"]]
+        assert compared.column("/__properties/run", "passed")[1] == [[1]]
+
+    def test_more_sets_than_hues_leave_the_oscillating_ones_a_shared_name(self, flown_run, tmp_path):
+        passes, cycles, _ = flown_run.flights
+        flights = [passes, *(renamed(cycles, f"cycling {n}") for n in range(9))]
+        read = Read(record_compare(dataclasses.replace(flown_run, flights=tuple(flights)), tmp_path / "c.rrd"))
+        roll = [entity for entity in read.chunks if entity.startswith("/1_step/roll/") and "cycling" in entity]
+        names = {read.column(entity, "SeriesLines:names")[1][0][0] for entity in roll}
+        assert len(roll) == 9
+        assert names == {"9 sets that oscillate: FAIL [deg]"}
+
+    def test_the_spread_is_that_of_the_uncertain_model(self, quick_scenario, flown_run, tmp_path):
+        scenario = quick_scenario()
+        step = dataclasses.replace(flown_run.flights[0])
+        found = spreads(scenario, [step])["step"]
+        low, high = found.low_rad["own_gains"], found.high_rad["own_gains"]
+        assert len(found.t_s) == len(low) == len(high)
+        assert np.allclose(np.diff(found.t_s), 0.02)
+        assert np.all(high >= low)
+        assert np.degrees(low[95]) < np.degrees(high[95]) < 10.5, "near the set-point after 1.9 s"
+        run = dataclasses.replace(flown_run, scenario=scenario)
+        times, values = Read(record_compare(run, tmp_path / "c.rrd")).column(
+            "/1_step/spread/02_own_gains", "Measurements:values"
+        )
+        assert np.allclose(times, found.t_s)
+        assert np.allclose(np.ravel(values), np.degrees(0.5 * (low + high)))
+
+    def test_no_spread_where_the_uncertainty_is_not_known(self, flown_run):
+        assert spreads(flown_run.scenario, flown_run.flights) == {}, "no manoeuvres"
 
     def test_it_has_its_own_layout(self, compared):
         assert compared.application_ids == {"froude-compare"}
@@ -366,12 +450,20 @@ def test_importing_the_outputs_costs_nothing_heavy():
 
 
 @pytest.mark.skipif(ctypes.util.find_library("vulkan") is None, reason="no Vulkan driver: the viewer cannot draw")
-def test_the_viewer_draws_the_comparison_without_complaint(flown_run, tmp_path):
+@pytest.mark.parametrize("tab", ["step", "track", "Vehicle, assumptions, gains"])
+def test_the_viewer_draws_the_comparison_without_complaint(flown_run, tmp_path, tab):
     path = record_compare(flown_run, tmp_path / "compare.rrd")
-    assert screenshot(path, tmp_path / "step.png", tab="step") == []
-    png = (tmp_path / "step.png").read_bytes()
+    assert screenshot(path, tmp_path / "page.png", tab=tab) == []
+    png = (tmp_path / "page.png").read_bytes()
     assert png.startswith(b"\x89PNG")
     assert png[16:24] == (1920).to_bytes(4, "big") + (1080).to_bytes(4, "big")
+
+
+@pytest.mark.skipif(ctypes.util.find_library("vulkan") is None, reason="no Vulkan driver: the viewer cannot draw")
+@pytest.mark.parametrize("tab", ["step", "track", "Whole flight", "3D", "Link"])
+def test_the_viewer_draws_every_page_of_a_flight_without_complaint(flight, tmp_path, tab):
+    record(tmp_path / "a.rrd", flight).close(flight_page(flight), flight_properties(flight), "# Link")
+    assert screenshot(tmp_path / "a.rrd", tmp_path / "page.png", tab=tab) == []
 
 
 def test_a_screenshot_of_nothing_is_an_error_that_names_it(tmp_path):
