@@ -140,9 +140,7 @@ class Simulator:
         # a sum with a NaN or an infinity in it is one itself
         if not (math.isfinite(sum(controls)) and min(controls) >= 0.0 and max(controls) <= 1.0):
             controls = self._made_safe(controls)
-        return Actuators(
-            int(message.time_usec), controls, bool(message.mode & _ARMED), bool(message.flags & _LOCKSTEP)
-        )
+        return Actuators(int(message.time_usec), controls, bool(message.mode & _ARMED), bool(message.flags & _LOCKSTEP))
 
     def _made_safe(self, controls: tuple[float, ...]) -> tuple[float, ...]:
         motors = []

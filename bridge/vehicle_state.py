@@ -23,7 +23,7 @@ class VehicleState:
 
     Attributes:
         nav_state: PX4's mode number, -1 before the first heartbeat. armed: motors may turn.
-        autopilot: MAV_AUTOPILOT, -1 before the first heartbeat; 12 is PX4. hil_enabled: a board that flies a simulation.
+        autopilot: MAV_AUTOPILOT, -1 before the first heartbeat; 12 is PX4. hil_enabled: of a board in HITL.
         system_status: MAV_STATE. prearm_ok: it would arm in this mode. landed_state: MAV_LANDED_STATE.
         home_alt_m: height of home above mean sea level, m; None until HOME_POSITION.
         position_ned, velocity_ned: m, m/s; None until LOCAL_POSITION_NED.

@@ -1,7 +1,7 @@
 """The earth's magnetic field at a place, from the World Magnetic Model 2025.
 
-Source: WMM2025 of NOAA and the British Geological Survey, as the library pygeomag computes it. PX4 looks declination and
-inclination up in tables of the same model, so a field from elsewhere would turn its heading.
+Source: WMM2025 of NOAA and the British Geological Survey, as the library pygeomag computes it. PX4 looks declination
+and inclination up in tables of the same model, so a field from elsewhere would turn its heading.
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from sitl.modes import Mode, Result
 from sitl.parameters import ParameterTable
@@ -17,6 +18,10 @@ from sitl.vehicle_spec import VehicleModel, resolve_vehicle
 Each = Callable[[int], None]
 
 _states = itertools.count(1)
+
+# how long an example takes depends on what else the computer does
+settings.register_profile("no deadline", deadline=None)
+settings.load_profile("no deadline")
 
 
 @pytest.fixture(scope="session", autouse=True)

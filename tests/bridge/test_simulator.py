@@ -263,7 +263,9 @@ class TestTruth:
     def test_only_when_asked_for(self) -> None:
         assert named(run(simulator(), 300), "HIL_STATE_QUATERNION") == []
 
-    @pytest.mark.parametrize(("interval_us", "count"), [(20_000, 100), (22_000, 91), (100_000, 20), (5000, 100), (1000, 100)])
+    @pytest.mark.parametrize(
+        ("interval_us", "count"), [(20_000, 100), (22_000, 91), (100_000, 20), (5000, 100), (1000, 100)]
+    )
     def test_at_the_interval_asked_for_or_at_50_hz(self, interval_us: int, count: int) -> None:
         sim = simulator()
         sim.receive(Autopilot().ask_for_truth(interval_us))

@@ -14,7 +14,7 @@ from sitl.sensors import EARTH_FIELD_GAUSS, ORIGIN
 
 
 def test_the_default_place_has_the_fields_own_value() -> None:
-    assert EARTH_FIELD_GAUSS == pytest.approx(earth_field_gauss(*ORIGIN), abs=1e-6)
+    assert earth_field_gauss(*ORIGIN) == pytest.approx(EARTH_FIELD_GAUSS, abs=1e-6)
 
 
 # test values published with WMM2025: height 0, 2025.0; X, Y, Z in nT
