@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.clock import utc_stamp
+from scenarios.flight_import import is_recording
 from scenarios.run_reader import RUN_JSON, STAMPED, load_json
 from scenarios.run_schema import SCHEMA_VERSION
 from scenarios.stored_flight import FLIGHTS
@@ -28,7 +29,8 @@ class RunSummary:
 
     Attributes:
         folder: of the run. started_utc: `2026-11-22T20:00:00Z`, empty if not known.
-        scenario: its name. vehicle: its spec, or name. autopilot: "own", "PX4", "board", or "other" behind a link.
+        scenario: its name. vehicle: its spec, or name.
+        autopilot: "own", "PX4", "board", "recorded", or "other" behind a link.
         verdicts: verdict -> number of gain sets.
         best: of the gain sets that passed the one closest to its set-point; empty if there is none.
         complete: flown to its end and written. problem: why not, or what hinders reading it; empty if nothing.
@@ -160,6 +162,8 @@ def summary(folder: Path) -> RunSummary:
 def autopilot(command: Iterable[str]) -> str:
     """Which autopilot flew, as far as the command tells: "own", "PX4", "board", or "other" that was there already.
 
+    A flight that was imported is "recorded", whoever flew it.
+
     Args:
         command: as typed, word by word.
     """
@@ -168,6 +172,8 @@ def autopilot(command: Iterable[str]) -> str:
     for word, after in zip(words, (*words[1:], ""), strict=False):
         name, equals, value = word.partition("=")
         options[name] = value if equals else after
+    if any(is_recording(Path(word)) for word in words):
+        return "recorded"
     if "--px4" in options:
         return "PX4"
     if "--hil" in options:

@@ -423,6 +423,7 @@ def test_there_may_be_no_runs(tmp_path: Path) -> None:
         ("froude fly --hil tcpin://:4560 --connect udpin://:14540", "PX4"),
         ("froude fly --hil=serial:///dev/ttyACM0 --arm-hardware", "board"),
         ("froude fly --connect udpin://:14540", "other"),
+        ("froude review a/flight.ulg --vehicle ant-x", "recorded"),
     ],
 )
 def test_who_flew_is_told_by_the_command(command: str, who: str) -> None:
