@@ -17,7 +17,7 @@ TESTS  := $(VENV)/.tests
 APT     = DEBIAN_FRONTEND=noninteractive apt-get
 AS_ROOT = [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null
 
-.PHONY: help demo test bench lint install install-test vulkan clean
+.PHONY: help demo test bench lint install install-test vulkan chromium clean
 .DELETE_ON_ERROR:
 
 help:
@@ -31,7 +31,7 @@ demo: $(FLIES)
 	@echo "==> flying the demo (the first flight compiles the control laws: up to half a minute)"
 	@$(BIN)/froude fly
 
-test: lint vulkan
+test: lint vulkan chromium
 	@echo "==> tests"
 	@$(BIN)/python -m pytest --numprocesses=auto --dist=loadfile
 
@@ -78,6 +78,13 @@ vulkan:
 	  $(AS_ROOT) && echo "==> installing Debian's mesa-vulkan-drivers" && { \
 	  { $(APT) update -qq && $(APT) install -y -qq --no-install-recommends mesa-vulkan-drivers libvulkan1 >/dev/null; } \
 	    || echo "    not possible; the picture test will be skipped"; }; } || true
+
+# The test of the report opens it in a browser. Without one it is skipped, and says so.
+chromium:
+	@{ command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null 2>&1 || { \
+	  $(AS_ROOT) && echo "==> installing Debian's chromium" && { \
+	  { $(APT) update -qq && $(APT) install -y -qq --no-install-recommends chromium >/dev/null; } \
+	    || echo "    not possible; the test of the report in a browser will be skipped"; }; } || true
 
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
