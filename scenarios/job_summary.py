@@ -73,6 +73,6 @@ def _text(text: str, *, keep_dash: bool = False) -> str:
     """
     flat = " ".join(text.split())
     lead, rest = ("- ", flat[2:]) if keep_dash and flat.startswith("- ") else ("", flat)
-    for character in "\\`*_[]":
+    for character in "\\`*_[]$":
         rest = rest.replace(character, "\\" + character)
     return lead + rest.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

@@ -138,8 +138,8 @@ class Set:
 
     @property
     def passed(self) -> bool:
-        """It met every limit."""
-        return self.outcome == "PASS"
+        """It is a candidate that met every limit."""
+        return self.outcome == "PASS" and not self.baseline
 
 
 @dataclass(frozen=True)

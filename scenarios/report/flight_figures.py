@@ -89,15 +89,15 @@ def step_figure(trace: StepTrace, style: Style, name: str, figure: str, own: Ste
         for metric, sign in (("settling_time_5pct_s", "5"), ("settling_time_2pct_s", "2")):
             settled_s = trace.metrics.get(metric)
             if settled_s is None:
-                if metric in trace.metrics:
-                    notes.append(f"{sign} never settles in {100 * BAND[metric]:g} %" if notes else "")
+                if metric in trace.metrics and overshoot is not None:
+                    notes.append(f"{sign} never settles in {100 * BAND[metric]:g} %")
                 continue
             axes.axvline(settled_s, ymin=0.0, color=INK["ink"], linewidth=0.9, linestyle=(0, (3, 2)))
             beside_s = settled_s + 0.01 * trace.duration_s
             axes.text(beside_s, (HIGHEST - 0.02) * size, sign, va="top", fontsize=SMALL, fontweight="bold")
             notes.append(f"{sign} settles in {100 * BAND[metric]:g} % {settled_s:.2f} s")
         reason = next((text for text in trace.reasons.values() if text), "")
-        shown = [note for note in notes if note] or _wrapped(reason or "nothing was measured")
+        shown = notes or _wrapped(reason or "nothing was measured")
         for row, text in enumerate(reversed(shown)):
             axes.text(
                 0.985, 0.03 + 0.085 * row, text, transform=axes.transAxes, ha="right", fontsize=SMALL, color=INK["ink"]

@@ -61,7 +61,7 @@ def flown_model(data: Mapping[str, Any]) -> FlownModel:
             float(data["scenario"]["setpoint_rate_hz"] or 50.0),
         )
     except (TypeError, ValueError, KeyError) as error:
-        problem = f"does not say enough of vehicle or profile to compute with ({error})"
+        problem = "does not say enough of vehicle, profile or manoeuvres to compute with"
         raise FileError("run.json", problem, "Fly it again with this version") from error
 
 

@@ -120,7 +120,7 @@ def step_sections(sets: Sets, telemetry: Telemetries) -> list[Section]:
             [heading(metric) for metric in shown],
             [Line(one.name, _cells(one, shown, name), one.style) for one in sets.all],
         )
-        notes = _blanks(sets, shown, name)
+        notes = [*_absent(sets, [one for one, _ in drawn]), *_blanks(sets, shown, name)]
         made.append(Section(f"step-{place}", _heading("Step response", name, names), lead, wide, grid, [table], notes))
     return made
 
@@ -156,7 +156,7 @@ def track_sections(sets: Sets, telemetry: Telemetries) -> list[Section]:
             [Line(one.name, _cells(one, shown, name), one.style) for one in sets.all],
         )
         lead = ["Broad grey line: the roll set-point that the vehicle reports; thin line: its roll angle."]
-        notes = _blanks(sets, shown, name)
+        notes = [*_absent(sets, [one for one, _ in drawn]), *_blanks(sets, shown, name)]
         made.append(
             Section(f"track-{place}", _heading("Tracking", name, names), lead, (), grid, [table], notes),
         )
@@ -169,6 +169,16 @@ def _heading(what: str, name: str, names: Sequence[str]) -> str:
 
 def _nothing_recorded() -> list[str]:
     return ["Nothing of it can be drawn: no telemetry of it is on disk."]
+
+
+def _absent(sets: Sets, drawn: Sequence[Set]) -> list[str]:
+    """Of which gain sets there is nothing to draw, and what became of their flights."""
+    return [
+        f"{one.name} is not drawn, its flight did not come to it, or no telemetry of it is on disk"
+        + (f": {one.data['reason']}" if one.data["reason"] else "")
+        for one in sets.all
+        if one not in drawn
+    ]
 
 
 def _own_traces(sets: Sets, segment: str) -> dict[str, StepTrace]:

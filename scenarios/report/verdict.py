@@ -162,7 +162,7 @@ def _ground(own: Object | None) -> tuple[str, str]:
     """Whether the airframe's own flight gains fly: a sentence, and the doubt that follows from it."""
     if own is None:
         return "", ""
-    who, reason = f"The airframe's own flight gains ({own['gain_set']})", own["reason"]
+    who, reason = f"The airframe's own flight gains ({own['gain_set']})", _worded(own["reason"])
     if own["fly"] is None:
         return f"{who}: whether they fly here is not known: {reason}.", ""
     if own["fly"]:

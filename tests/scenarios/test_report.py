@@ -284,7 +284,7 @@ class TestTold:
         assert "Trust 1 of 3 gain sets on ANT-X: own gains." in page.text
         assert "arming refused: no gyro" in page.text
         assert "limit cycle on roll: 2.1 rad/s at 9.0 Hz" in page.text
-        assert "does not say enough of vehicle or profile" in page.text  # this run.json does not
+        assert "does not say enough of vehicle, profile or manoeuvres" in page.text  # this run.json does not
         assert "∞" in page.table("Margins")[1]["own gains"]
 
     def test_nothing_known_at_all(self, tmp_path):
