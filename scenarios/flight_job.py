@@ -90,13 +90,17 @@ class FlightJob:
 
     @property
     def rows_per_chunk(self) -> int:
-        """Telemetry rows that are written together: fewer over a link that may die."""
-        return sampler.ROWS_PER_BATCH if self.in_memory else 250
+        """Telemetry rows that are recorded together: of a moment; over a link that may die, of a second."""
+        return 2 * sampler.ROWS_PER_BATCH if self.in_memory else 250
 
     @property
     def rows_per_batch(self) -> int:
         """Telemetry rows that are handed over together: few for eyes that watch in real time."""
-        return 50 if self.live_port is not None and not self.in_memory else self.rows_per_chunk
+        return (
+            50
+            if self.live_port is not None and not self.in_memory
+            else min(self.rows_per_chunk, sampler.ROWS_PER_BATCH)
+        )
 
     @property
     def in_memory(self) -> bool:

@@ -218,6 +218,14 @@ def flight_blueprint(pages: Sequence[Page], whole: Page | None) -> Any:
     return tabbed([*tabs, _whole_flight(whole), _space(first or whole), _link(whole)], first)
 
 
+def unfinished_blueprint() -> Any:
+    """Layout of a flight whose recording was never finished: little, but enough to look at."""
+    import rerun.blueprint as rrb
+
+    plots = rrb.Vertical(series("Roll angle [deg]", "/roll"), series("Motor commands [0..1]", "/motors"), _lanes())
+    return tabbed([rrb.Horizontal(plots, _events(), column_shares=[2.4, 1.0], name="Unfinished flight")], None)
+
+
 def _manoeuvre(page: Page) -> Any:
     import rerun.blueprint as rrb
 

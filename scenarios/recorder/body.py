@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from scenarios.recorder.stream import Colour, Recording
 
-PATH_STRIDE = 25
-"""Every so many rows a corner of the path."""
+STRIDE = 4
+"""Every so many rows the vehicle is placed: more often than a screen shows."""
+PATH_STRIDE = 6
+"""Every so many of these a corner of the path."""
 PLACE = "/world/place"
 """Where the vehicle is, without its attitude: seen from here it is in the middle, the horizon level."""
 BODY = PLACE + "/body"
@@ -126,6 +128,10 @@ class BodyView:
         import rerun as rr
 
         recording = self._recording
+        # the last row always: what follows may be far away in time
+        shown = np.unique(np.append(np.arange(0, len(time_s), STRIDE), len(time_s) - 1))
+        time_s, enu_m, motors = time_s[shown], enu_m[shown], motors[shown]
+        columns = {name: columns[name][shown] for name in ("phi_rad", "theta_rad", "psi_rad")}
         quat = enu_quaternions(columns["phi_rad"], columns["theta_rad"], columns["psi_rad"])
         recording.columns(PLACE, time_s, rr.Transform3D.columns(translation=enu_m))
         recording.columns(BODY, time_s, rr.Transform3D.columns(quaternion=quat[:, (1, 2, 3, 0)]))

@@ -59,10 +59,10 @@ class FlightDrawing:
     """Draws one flight.
 
     Args:
-        recording: where to. vehicle: what flies.
+        recording: where to. vehicle: what flies. live: somebody looks on while it flies.
     """
 
-    def __init__(self, recording: Recording, vehicle: FlownVehicle) -> None:
+    def __init__(self, recording: Recording, vehicle: FlownVehicle, *, live: bool = False) -> None:
         self.recording = recording
         rotors = vehicle.rotors
         self._extremes = roll_extremes(rotors)
@@ -79,8 +79,8 @@ class FlightDrawing:
         self._last_s = np.nan
         self._segments: list[Segment] = []
         self._shown: list[NDArray[np.float64]] = []
-        # A first layout, for live viewers and for a file that is never closed.
-        recording.layout(blueprints.flight_blueprint((), None))
+        # A first layout: the final one, which a file gets at its end, takes as long as seconds of flying.
+        recording.layout(blueprints.flight_blueprint((), None) if live else blueprints.unfinished_blueprint())
         self._style()
         self._body = BodyView(recording, rotors, self._motor_colours, vehicle.frame_m)
 
@@ -132,10 +132,11 @@ class FlightDrawing:
             self._write_terms(self._terms.finish())
         # A segment that begins where another ends takes its place.
         starts = {segment.start_s for segment in self._segments}
-        for segment in self._segments:
-            self.recording.lane("/state/manoeuvre", segment.start_s, segment.name)
-            if segment.end_s not in starts:
-                self.recording.lane("/state/manoeuvre", segment.end_s, "")
+        states = [(segment.start_s, segment.name) for segment in self._segments]
+        states += [(segment.end_s, "") for segment in self._segments if segment.end_s not in starts]
+        if states:
+            states.sort()
+            self.recording.lanes("/state/manoeuvre", np.array([t for t, _ in states]), [state for _, state in states])
 
     def end(self, summary: str, link: str, properties: Mapping[str, Mapping[str, Any]]) -> None:
         """Write what belongs to the whole flight, and the final layout.

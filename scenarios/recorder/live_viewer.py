@@ -53,7 +53,7 @@ class LiveView:
         self.finish()
         stream = rr.RecordingStream(application_id, recording_id=recording_id)
         stream.set_sinks(rr.GrpcSink(self._uri))
-        self._drawing = FlightDrawing(Recording(stream, name), vehicle)
+        self._drawing = FlightDrawing(Recording(stream, name), vehicle, live=True)
 
     def rows(self, batch: Columns) -> None:
         """Telemetry rows."""
