@@ -243,7 +243,7 @@ def _manoeuvre(page: Page) -> Any:
             series("Motor commands [0..1]", "/motors", page, (-0.03, 1.03)),
         ),
         _lanes(page),
-        row_shares=[3.6, 2.4, 3.2, 2.6, 2.3],
+        row_shares=[3.5, 2.3, 3.0, 2.4, 2.9],
     )
     return rrb.Horizontal(plots, _verdict_and_events(), column_shares=[2.4, 1.0], name=page.name)
 

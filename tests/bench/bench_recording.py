@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from scenarios.flight import FlightRecord, RunRecord
+from scenarios.flight_job import FlightJob
 from scenarios.gain_set import load_gain_sets
 from scenarios.one_flight import fly
 from scenarios.recorder import FlightRecorder
@@ -33,7 +34,7 @@ MOST_OVER_PARQUET = 30.0
 """Times as long as writing the same rows into Parquet, uncompressed, at most."""
 
 
-def planned(gains: str = "table_2_2/ANT-X", vehicle: str = "ant-x"):
+def planned(gains: str = "table_2_2/ANT-X", vehicle: str = "ant-x") -> FlightJob:
     loaded = dataclasses.replace(load_scenario("demo"), vehicle=vehicle)
     (gain_set,) = load_gain_sets(gains)
     return plan(gain_set, loaded, loaded.resolve_vehicle(), loaded.resolve_profile())
