@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from bridge.framing import Counters, FrameSplitter, crc16
-from bridge.messages import BY_ID, BY_NAME, MAGIC_2, SIGNATURE, SIGNED, Message
+from bridge.messages import BY_ID, BY_NAME, MAGIC_2, SIGNATURE, SIGNED, Message, MessageType
 from bridge.signing import Signer
 from sitl.errors import UsageError
 
@@ -95,8 +95,15 @@ class Connection:
         if kind is None:
             near = difflib.get_close_matches(name, BY_NAME, n=1)
             raise UsageError(f"no MAVLink message {name!r}" + (f"; did you mean {near[0]}?" if near else ""))
+        return self.encode_payload(kind, kind.pack(fields))
+
+    def encode_payload(self, kind: MessageType, payload: bytes) -> bytes:
+        """Return one frame of a payload that is packed already.
+
+        Args:
+            kind: the message. payload: in wire order; zeros at its end may be missing.
+        """
         # MAVLink 2 cuts the zeros off the end but keeps one byte.
-        payload = kind.pack(fields)
         payload = payload.rstrip(b"\0") or payload[:1]
         signer = self._signer
         flags = 0 if signer is None else signer.flags
@@ -114,6 +121,25 @@ class Connection:
         """Return the messages these bytes complete, in order; damage is counted and never raises."""
         messages = self._splitter.feed(data)
         return messages if self.on_frame is None else self._logged(messages)
+
+    def lone_payload(self, data: bytes, kind: MessageType) -> tuple[int, bytes] | None:
+        """The payload of a piece that is one whole good unsigned frame of this message, and nothing else; or None.
+
+        Where it is not None the frame is received, as by `receive`; where it is, nothing has happened yet. For loops in
+        which somebody waits for every microsecond.
+
+        Args:
+            data: as it came. kind: the message.
+
+        Returns:
+            (sender's system, payload with its zeros put back).
+        """
+        payload = self._splitter.lone(data, kind)
+        if payload is None:
+            return None
+        if self.on_frame is not None:
+            self._log(data)
+        return data[5], payload
 
     def flush(self) -> list[Message]:
         """Return what a quiet stream still holds: messages that waited for bytes that do not come."""

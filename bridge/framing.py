@@ -167,6 +167,29 @@ class FrameSplitter:
                 return [Message(kind, data, HEADER_2, stop, data[5])]
         return self._split(self._rest + data if self._rest else data, final=self._datagram)
 
+    def lone(self, data: bytes, kind: MessageType) -> bytes | None:
+        """The whole payload of a piece that is one good unsigned frame of this message; None, and nothing done, if not.
+
+        Args:
+            data: as it came. kind: the message.
+        """
+        stop = len(data) - 2
+        if (
+            stop <= HEADER_2
+            or data[0] != MAGIC_2
+            or data[2]
+            or data[1] != stop - HEADER_2
+            or data[7:10] != kind.id_bytes
+            or self._rest
+            or self._adrift
+            or self.signer is not None
+            or crc16(data[1:stop] + kind.crc_extra) != data[stop] | data[stop + 1] << 8
+        ):
+            return None
+        self._counters.received += 1
+        self._counters.heard(data[5], data[6], data[4])
+        return data[HEADER_2:stop].ljust(kind.size, b"\0")
+
     def flush(self) -> list[Message]:
         """Decide on what is kept as if nothing were to follow: the line is quiet, or the stream has ended."""
         return self._split(self._rest, final=True)

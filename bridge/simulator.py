@@ -6,10 +6,12 @@ Source: PX4 ``simulator_mavlink`` (lockstep over TCP) and ``mavlink_receiver`` (
 from __future__ import annotations
 
 import math
+import struct
 from collections import deque
 from typing import Any, NamedTuple
 
 from bridge.connection import Connection, Message
+from bridge.messages import BY_NAME
 from bridge.telemetry import int16, int32, uint16
 from sitl.body import Body
 from sitl.sensors import Gps, geodetic
@@ -32,6 +34,11 @@ _PX4 = 12
 _NOBODY = 8
 _COG_UNKNOWN = 65535
 _KEPT = 64
+
+# In wire order; packed and unpacked without the messages' general way, because the lockstep waits for it.
+_SENSOR_KIND, _ACTUATOR_KIND = BY_NAME["HIL_SENSOR"], BY_NAME["HIL_ACTUATOR_CONTROLS"]
+_SENSOR, _ACTUATOR = struct.Struct("<Q13fIB"), struct.Struct("<QQ16fB")
+_NO_SLOW = (0.0,) * 7
 
 
 class Actuators(NamedTuple):
@@ -92,8 +99,8 @@ class Simulator:
             # whole intervals, so that 5 ms asked of a 4 ms tick are 5 ms on average
             self._truth_due_us = max(self._truth_due_us + self._truth_interval_us, now_us)
             frames.append(self.connection.encode_fields("HIL_STATE_QUATERNION", truth_fields(self.body)))
-        frames.append(self.connection.encode_fields("HIL_SENSOR", sensor_fields(self.body)))
-        return b"".join(frames)
+        sensor = self.connection.encode_payload(_SENSOR_KIND, _SENSOR.pack(*sensor_values(self.body)))
+        return b"".join((*frames, sensor)) if frames else sensor
 
     def heartbeat(self) -> bytes:
         """A HEARTBEAT of a simulator: a board streams nothing to a link that it has never heard on."""
@@ -107,6 +114,9 @@ class Simulator:
         Args:
             data: as it came.
         """
+        lone = self.connection.lone_payload(data, _ACTUATOR_KIND)
+        if lone is not None:
+            return self._lone(*lone)
         return [made for message in self.connection.receive(data) if (made := self.take(message)) is not None]
 
     def take(self, message: Message) -> Actuators | None:
@@ -116,7 +126,7 @@ class Simulator:
             return None
         if message.name == "HIL_ACTUATOR_CONTROLS":
             self.system = message.sysid
-            return self._actuators(message)
+            return self._actuators(message.time_usec, message.flags, message.controls, message.mode)
         if message.name == "HEARTBEAT" and message.autopilot != _NOBODY:
             self.system = message.sysid
             self.is_px4 = message.autopilot == _PX4
@@ -135,12 +145,19 @@ class Simulator:
         self._truth_interval_us = None
         self.others.clear()
 
-    def _actuators(self, message: Message) -> Actuators:
-        controls: tuple[float, ...] = message.controls
+    def _lone(self, system: int, payload: bytes) -> list[Actuators]:
+        if self.system and system != self.system:
+            self.strangers += 1
+            return []
+        self.system = system
+        values = _ACTUATOR.unpack_from(payload)
+        return [self._actuators(values[0], values[1], values[2:18], values[18])]
+
+    def _actuators(self, time_us: int, flags: int, controls: tuple[float, ...], mode: int) -> Actuators:
         # a sum with a NaN or an infinity in it is one itself
         if not (math.isfinite(sum(controls)) and min(controls) >= 0.0 and max(controls) <= 1.0):
             controls = self._made_safe(controls)
-        return Actuators(int(message.time_usec), controls, bool(message.mode & _ARMED), bool(message.flags & _LOCKSTEP))
+        return Actuators(time_us, controls, bool(mode & _ARMED), bool(flags & _LOCKSTEP))
 
     def _made_safe(self, controls: tuple[float, ...]) -> tuple[float, ...]:
         motors = []
@@ -155,25 +172,28 @@ class Simulator:
         return tuple(motors)
 
 
-def sensor_fields(body: Body) -> dict[str, Any]:
-    """HIL_SENSOR of this tick: m/s^2, rad/s, gauss, hPa, body axes forward-right-down; id 0.
+def sensor_values(body: Body) -> tuple[float, ...]:
+    """HIL_SENSOR of this tick, in wire order: m/s^2, rad/s, gauss, hPa, body axes forward-right-down; id 0.
 
     Args:
         body: just stepped.
     """
     sensors = body.sensors
-    updated = IMU
-    fields: dict[str, Any] = {"time_usec": body.time_us, "id": 0}
-    fields["xacc"], fields["yacc"], fields["zacc"] = sensors.accel()
-    fields["xgyro"], fields["ygyro"], fields["zgyro"] = sensors.gyro.tolist()
-    if body.tick % SLOW_TICKS == 0:
-        updated |= MAG | BARO
-        fields["xmag"], fields["ymag"], fields["zmag"] = sensors.mag()
-        fields["abs_pressure"] = pressure = sensors.pressure()
-        fields["pressure_alt"] = 44330.77 * (1.0 - (max(0.0, pressure) / 1013.25) ** 0.1902632)
-        fields["temperature"] = TEMPERATURE_DEG_C
-    fields["fields_updated"] = updated
-    return fields
+    fast = (body.time_us, *sensors.accel(), *sensors.gyro.tolist())
+    if body.tick % SLOW_TICKS:
+        return *fast, *_NO_SLOW, IMU, 0
+    pressure = sensors.pressure()
+    pressure_alt_m = 44330.77 * (1.0 - (max(0.0, pressure) / 1013.25) ** 0.1902632)
+    return *fast, *sensors.mag(), pressure, 0.0, pressure_alt_m, TEMPERATURE_DEG_C, IMU | MAG | BARO, 0
+
+
+def sensor_fields(body: Body) -> dict[str, Any]:
+    """`sensor_values` by the names of the fields.
+
+    Args:
+        body: just stepped.
+    """
+    return dict(zip((field.name for field in _SENSOR_KIND.fields), sensor_values(body), strict=True))
 
 
 def gps_fields(fix: Gps) -> dict[str, Any]:

@@ -1,14 +1,13 @@
 """What our side of a lockstep costs, and how much of a real PX4's own speed is left beside it.
 
 Run: make bench. The second part needs a PX4 SITL that you have built: `FROUDE_PX4=PX4-Autopilot/build/px4_sitl_default
-make bench`. It flies the same PX4 with our plant and with an empty simulator, which sends prepared bytes and computes
-nothing, in turns, and compares.
+make bench`. One PX4 is served by our plant and by an empty simulator, which sends prepared bytes and computes nothing,
+in turns of half a second, on the same connection.
 """
 
 from __future__ import annotations
 
 import os
-import socket
 import statistics
 import struct
 import time
@@ -25,7 +24,7 @@ from bridge.lockstep import Lockstep
 from bridge.messages import BY_NAME
 from bridge.simulator import Simulator, gps_fields, sensor_fields
 from scenarios.px4_process import Px4Process, free_instance
-from sitl.body import Body
+from sitl.body import RATE_HZ, START_US, Body
 from sitl.profile import get_profile
 from sitl.vehicle_spec import resolve_vehicle
 
@@ -34,9 +33,9 @@ pytestmark = pytest.mark.bench
 STEPS = 20_000
 MOST_OVER_PLANT = 10.0
 LEAST_SHARE = 0.9
-ROUNDS = 3
-WARM_S, MEASURED_S = 8.0, 30.0
-_GPS_STEPS, _VARIANTS, _START_US, _TICK_US = 25, 500, 1_000_000, 4_000
+ROUNDS = 40
+WARM_S, SLICE_S = 8.0, 0.5
+_GPS_TICKS, _VARIANTS, _ACTUATORS = 25, 500, 93
 
 
 def body() -> Body:
@@ -75,14 +74,14 @@ def test_cost_of_a_step() -> None:
 # -- beside an empty simulator ---------------------------------------------------------------------------------
 
 
-class EmptySimulator:
-    """Sends prepared samples of a vehicle at rest, one for each answer."""
+class EmptySteps:
+    """An empty simulator in the place of a lockstep's plant, on the same connection to the same PX4.
 
-    def __init__(self, port: int) -> None:
-        self.listener = socket.socket()
-        self.listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        self.listener.bind(("127.0.0.1", port))
-        self.listener.listen(1)
+    It sends prepared samples of a vehicle at rest and takes any answer for the right one.
+    """
+
+    def __init__(self, lockstep: Lockstep) -> None:
+        self.body, self.link = lockstep.body, lockstep.link
         rest = body()
         self.samples, self.fixes = [], []
         for _ in range(_VARIANTS):
@@ -90,97 +89,55 @@ class EmptySimulator:
             self.samples.append(bytearray(BY_NAME["HIL_SENSOR"].pack(sensor_fields(rest))))
             if (fix := rest.fix()) is not None:
                 self.fixes.append(bytearray(BY_NAME["HIL_GPS"].pack(gps_fields(fix))))
-        self.sent = self.step_no = 0
-        self.locked = False
-
-    @property
-    def vehicle_s(self) -> float:
-        return self.step_no * _TICK_US * 1e-6
-
-    def accept(self) -> None:
-        self.listener.settimeout(30.0)
-        self.peer, _ = self.listener.accept()
-        self.peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.peer.settimeout(_TICK_US * 1e-6)
-        self.buffer = b""
+        self.sent = 0
 
     def step(self) -> None:
-        time_us = _START_US + self.step_no * _TICK_US
-        data = b""
-        if self.step_no % _GPS_STEPS == 0:
-            data = self._frame("HIL_GPS", self.fixes[self.step_no // _GPS_STEPS % len(self.fixes)], time_us)
-        self.peer.sendall(data + self._frame("HIL_SENSOR", self.samples[self.step_no % _VARIANTS], time_us))
-        self.step_no += 1
-        while not self._answered():
-            try:
-                self.buffer += self.peer.recv(4096)
-            except TimeoutError:
-                if not self.locked:
-                    return
+        tick, data = self.body.tick, b""
+        if tick % _GPS_TICKS == 0:
+            data = self._frame("HIL_GPS", self.fixes[tick // _GPS_TICKS % len(self.fixes)])
+        self.link.send(data + self._frame("HIL_SENSOR", self.samples[tick % _VARIANTS]))
+        while True:
+            answer = self.link.recv(5.0)
+            assert answer is not None, "the PX4 does not answer"
+            if len(answer) > 9 and answer[7] == _ACTUATORS:
+                break
+        self.body.tick += 1
 
-    def _answered(self) -> bool:
-        while len(self.buffer) >= 10 and len(self.buffer) >= (whole := self.buffer[1] + 12):
-            message_id = self.buffer[7]
-            self.buffer = self.buffer[whole:]
-            if message_id == 93:
-                self.locked = True
-                self.peer.settimeout(5.0)
-                return True
-        return False
-
-    def _frame(self, name: str, payload: bytearray, time_us: int) -> bytes:
+    def _frame(self, name: str, payload: bytearray) -> bytes:
         kind = BY_NAME[name]
-        struct.pack_into("<Q", payload, 0, time_us)
+        struct.pack_into("<Q", payload, 0, self.body.time_us)
         head = struct.pack("<6B3s", len(payload), 0, 0, self.sent & 0xFF, 254, 51, kind.id_bytes)
         self.sent += 1
         checked = head + payload
         return b"\xfd" + checked + fastcrc.crc16.mcrf4xx(checked + kind.crc_extra).to_bytes(2, "little")
 
-    def close(self) -> None:
-        self.peer.close()
-        self.listener.close()
-
-
-def empty_speed(build: Path, folder: Path) -> float:
-    instance = free_instance()
-    simulator = EmptySimulator(4560 + instance)
-    with Px4Process(build, folder, instance):
-        simulator.accept()
-        try:
-            return measured(simulator.step, lambda: simulator.vehicle_s)
-        finally:
-            simulator.close()
-
-
-def our_speed(build: Path, folder: Path) -> float:
-    process = Px4Process(build, folder, free_instance())
-    plant = body()
-    with open_link(process.simulator_url) as link, process:
-        lockstep = Lockstep(link, Simulator(plant, truth=True))
-        return measured(lockstep.step, lambda: plant.time_us * 1e-6)
-
-
-def measured(step: Callable[[], object], vehicle_s: Callable[[], float]) -> float:
-    """Vehicle seconds per second, once it has started."""
-    began = vehicle_s()
-    while vehicle_s() < began + WARM_S:
-        step()
-    from_s, start = vehicle_s(), time.perf_counter()
-    while vehicle_s() < from_s + MEASURED_S:
-        step()
-    return (vehicle_s() - from_s) / (time.perf_counter() - start)
-
 
 @pytest.mark.skipif("FROUDE_PX4" not in os.environ, reason="FROUDE_PX4 names no build of a PX4 SITL")
 def test_share_of_a_real_px4s_own_speed(tmp_path: Path) -> None:
-    build = Path(os.environ["FROUDE_PX4"])
-    pairs = [
-        (empty_speed(build, tmp_path / f"empty{n}"), our_speed(build, tmp_path / f"ours{n}")) for n in range(ROUNDS)
-    ]
-    shares = [ours / empty for empty, ours in pairs]
+    process = Px4Process(Path(os.environ["FROUDE_PX4"]), tmp_path, free_instance())
+    with open_link(process.simulator_url) as link, process:
+        lockstep = Lockstep(link, Simulator(body(), truth=True))
+        while lockstep.body.time_us < START_US + WARM_S * 1e6 or not lockstep.locked:
+            lockstep.step()
+        empty = EmptySteps(lockstep)
+        shares, speeds = [], []
+        for _ in range(ROUNDS):
+            # ours, empty, empty, ours: what changes slowly meanwhile falls out
+            times = [seconds(step) for step in (lockstep.step, empty.step, empty.step, lockstep.step)]
+            shares.append((times[1] + times[2]) / (times[0] + times[3]))
+            speeds.append(2.0 * SLICE_S / (times[0] + times[3]))
+        assert lockstep.report.late == 0
     share = statistics.median(shares)
-    empty, ours = np.median(pairs, axis=0)
     print(
-        f"\nPX4 in lockstep: {ours:.1f} x real time with our plant, {empty:.1f} x with an empty simulator: {share:.0%}"
+        f"\nPX4 in lockstep with our plant: {statistics.median(speeds):.1f} x real time, {share:.0%} of what it "
+        f"reaches with an empty simulator (quartiles {np.quantile(shares, 0.25):.0%}, {np.quantile(shares, 0.75):.0%})"
     )
     assert share > LEAST_SHARE
+
+
+def seconds(step: Callable[[], object]) -> float:
+    """Wall-clock time of SLICE_S of vehicle time."""
+    start = time.perf_counter()
+    for _ in range(round(SLICE_S * RATE_HZ)):
+        step()
+    return time.perf_counter() - start
