@@ -43,7 +43,7 @@ def quick(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def froude(capsys: pytest.CaptureFixture[str]) -> Froude:
+def froude(capsys: pytest.CaptureFixture[str], without_report: None) -> Froude:
     """Runs the command line in this process; (exit status, standard output, standard error)."""
 
     def run(*words: object) -> tuple[int, str, str]:
@@ -123,8 +123,10 @@ class TestFly:
         assert froude(*words, "--gate")[0] == status
         assert froude(*words)[0] == 0
 
-    def test_junit(self, froude: Froude, quick: Path, tmp_path: Path) -> None:
-        status, _, _ = froude("fly", quick, "--junit", tmp_path / "out.xml", "--out", tmp_path / "runs")
+    def test_junit_and_markdown(self, froude: Froude, quick: Path, tmp_path: Path) -> None:
+        files = ("--junit", tmp_path / "out.xml", "--markdown", tmp_path / "out.md")
+        status, _, _ = froude("fly", quick, *files, "--out", tmp_path / "runs")
+        assert (tmp_path / "out.md").read_text().startswith("## Trust 2.2 ANT-X on ANT-X.\n")
         assert status == 0
         suite = ET.parse(tmp_path / "out.xml").getroot()
         assert suite.get("failures") == "0"
@@ -157,6 +159,7 @@ class TestMistakes:
             (["--connect", "serial:///dev/ttyACM0:57600"], "--arm-hardware"),
             (["--out", "{tmp}/quick.toml"], "the run's folder cannot be made"),
             (["--junit", "{tmp}/nowhere/out.xml"], "its folder does not exist. Make the folder"),
+            (["--markdown", "{tmp}/nowhere/out.md"], "write --markdown to another place"),
         ],
     )
     def test_options(self, froude: Froude, quick: Path, tmp_path: Path, words: list[str], says: str) -> None:

@@ -222,7 +222,8 @@ class TestRepeatable:
 
 class TestFolder:
     def test_everything_is_there_and_nothing_else(self, folder: Path, run: Any) -> None:
-        assert sorted(path.name for path in folder.iterdir()) == ["compare.rrd", "flights", "junit.xml", "run.json"]
+        names = ["compare.rrd", "flights", "junit.xml", "report.html", "run.json"]
+        assert sorted(path.name for path in folder.iterdir()) == names
         kinds = {"rrd", "parquet", "tlog", "params", "backup.params"}
         assert all(set(flight["files"]) == kinds for flight in run["flights"])
         named = {file for flight in run["flights"] for file in flight["files"].values()}
