@@ -33,6 +33,7 @@ MOST_MB = 5.0
 MOST_OPEN_S = 2.0
 
 
+@pytest.mark.timeout(1800)
 def test_what_recording_and_report_add(tmp_path, capsys):
     scenario = load_scenario("demo")
     kinds = {
