@@ -61,7 +61,9 @@ def test_a_minute_of_telemetry(tmp_path: Path, capsys: pytest.CaptureFixture[str
     seconds, yardstick, path = [], [], tmp_path / "a.rrd"
     for number in range(REPEATS):
         start = time.perf_counter()
-        recorder = FlightRecorder(path, name="a", recording_id=f"a{number}", vehicle=vehicle, rows_per_chunk=job.rows_per_chunk)
+        recorder = FlightRecorder(
+            path, name="a", recording_id=f"a{number}", vehicle=vehicle, rows_per_chunk=job.rows_per_chunk
+        )
         for first in range(0, len(columns["t_s"]), 1000):
             recorder.append({name: values[first : first + 1000] for name, values in columns.items()})
         recorder.close("# a")
@@ -92,7 +94,11 @@ def test_share_of_a_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
         for job, record in zip(jobs, records, strict=True):
             path = tmp_path / f"{job.slug}.again.rrd"
             recorder = FlightRecorder(
-                path, name=job.slug, recording_id="again", vehicle=job.flown_vehicle(), rows_per_chunk=job.rows_per_chunk
+                path,
+                name=job.slug,
+                recording_id="again",
+                vehicle=job.flown_vehicle(),
+                rows_per_chunk=job.rows_per_chunk,
             )
             for first in range(0, len(record.telemetry), 1000):
                 recorder.append(
