@@ -134,7 +134,7 @@ class TestFly:
     def test_live_tells_how_to_look_on_standard_error(self, froude: Froude, quick: Path, tmp_path: Path) -> None:
         status, out, err = froude("fly", quick, "--live", "--json", "--out", tmp_path / "runs")
         assert status == 0
-        assert one_line(err).startswith("live view: rerun --connect rerun+http://127.0.0.1:")
+        assert one_line(err).startswith("live view: look on with: rerun --connect rerun+http://127.0.0.1:")
         json.loads(out)
 
 

@@ -441,8 +441,7 @@ class TestInterrupts:
 
 
 def test_the_files_of_a_flight_are_there_whole_or_called_partial(tmp_path: Path, quick_job: Any) -> None:
-    rotors = quick_job().model.airframe.rotors
-    with FlightFiles(tmp_path, "x", name="x", rotors=rotors) as files:
+    with FlightFiles(tmp_path, "x", name="x", vehicle=quick_job().flown_vehicle()) as files:
         files.frame(0, b"frame")
         assert {path.name for path in tmp_path.iterdir()} == {"x.partial.rrd", "x.partial.tlog"}
     assert {path.name for path in tmp_path.iterdir()} == {"x.partial.rrd", "x.partial.tlog"}

@@ -175,7 +175,7 @@ class TestFlights:
         )
         said: list[str] = []
         result = run_scenario(
-            load_scenario(str(scenario)), RunOptions(out=tmp_path / "logs", px4=made, say=said.append)
+            load_scenario(str(scenario)), RunOptions(out=tmp_path / "logs", px4=made, say=said.append, report=False)
         )
         assert result.stopped is None, said
         assert len(result.run.flights[0].telemetry) > 1000

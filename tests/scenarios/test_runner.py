@@ -203,7 +203,7 @@ class TestRepeatable:
     def test_side_by_side_or_one_after_the_other_is_the_same(
         self, scenario: Any, folder: Path, run: Any, tmp_path: Path
     ) -> None:
-        result = run_scenario(scenario, RunOptions(out=tmp_path, jobs=2))
+        result = run_scenario(scenario, RunOptions(out=tmp_path, jobs=2, report=False))
         assert result.folder is not None
         other = json.loads((result.folder / "run.json").read_text(encoding="utf-8"))
         for one, two in zip(run["flights"], other["flights"], strict=True):
@@ -283,7 +283,7 @@ class TestPlan:
     def test_a_candidate_of_that_name_keeps_its_files(self, quick_scenario: Any, tmp_path: Path) -> None:
         file = tmp_path / "mine.toml"
         file.write_text('[[gain_set]]\nname = "own ANT-X"\n[gain_set.parameters]\nMC_ROLL_P = 5.0\n')
-        result = run_scenario(quick_scenario(gain_sets=(str(file),)), RunOptions(out=tmp_path))
+        result = run_scenario(quick_scenario(gain_sets=(str(file),)), RunOptions(out=tmp_path, report=False))
         assert result.folder is not None
         assert (result.folder / "flights" / "own_ant-x.parquet").is_file()
         assert (result.folder / "flights" / "own_ant-x_baseline.parquet").is_file()
@@ -296,7 +296,7 @@ class TestPlan:
         file = tmp_path / "mine.toml"
         file.write_text("\n".join(tables), encoding="utf-8")
         scenario = quick_scenario(gain_sets=(str(file),), manoeuvres=(), vehicle="ant-x")
-        result = run_scenario(scenario, RunOptions(out=tmp_path / "runs"))
+        result = run_scenario(scenario, RunOptions(out=tmp_path / "runs", report=False))
         assert result.folder is not None
         run = json.loads((result.folder / "run.json").read_text(encoding="utf-8"))
         assert [flight["gain_set"]["name"] for flight in run["flights"]] == names
@@ -335,7 +335,7 @@ class TestStopped:
             if (at.index, at.phase) == (1, "track"):
                 raise KeyboardInterrupt
 
-        result = run_scenario(scenario, RunOptions(out=tmp_path), progress)
+        result = run_scenario(scenario, RunOptions(out=tmp_path, report=False), progress)
         assert isinstance(result.stopped, KeyboardInterrupt)
         assert result.folder is not None
         run = json.loads((result.folder / "run.json").read_text(encoding="utf-8"))

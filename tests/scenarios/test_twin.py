@@ -258,7 +258,7 @@ def another_autopilot(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 def run_twice(quick_scenario: Any, tmp_path: Path, **options: Any) -> RunResult:
     scenario = quick_scenario(gain_sets=("table_2_2/ANT-X", "table_7_2/ADAM-0"))
-    return run_scenario(scenario, RunOptions(out=tmp_path, px4=Path("nowhere"), **options))
+    return run_scenario(scenario, RunOptions(out=tmp_path, px4=Path("nowhere"), report=False, **options))
 
 
 def test_a_run_with_a_real_autopilot_flies_everything_twice(
@@ -313,7 +313,7 @@ def test_verdicts_and_gate_are_those_of_the_real_one(
 ) -> None:
     another_autopilot["gyro_cutoff_hz"] = 3.0  # nothing flies with that
     scenario = quick_scenario()
-    result = run_scenario(scenario, RunOptions(out=tmp_path, px4=Path("nowhere")))
+    result = run_scenario(scenario, RunOptions(out=tmp_path, px4=Path("nowhere"), report=False))
     (twin,) = result.run.twins
     assert (twin.flight.outcome, twin.own.outcome) == (Outcome.FAIL, Outcome.PASS)
     assert result.folder is not None
