@@ -133,7 +133,7 @@ def test_the_log_of_that_flight(
 
 def downloaded(mavproxy: Console, number: int, path: Path) -> None:
     """Download a log, again if it comes to no end."""
-    for limit_s in (10.0, 20.0, 30.0):
+    for limit_s in (40.0, 60.0, 60.0):
         mavproxy.say(f"log download {number} {path.name}")
         try:
             mavproxy.until(rf"Finished downloading {path.name}", limit_s)
