@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import sys
 from collections.abc import Callable
@@ -217,15 +216,6 @@ def findings_text(findings: list[Finding]) -> str:
     else:
         lines.append("nothing keeps it from flying this plant")
     return "\n".join(lines)
-
-
-def plain(value: Any) -> Any:
-    """A report as JSON takes it: dataclasses as objects, their properties left out.
-
-    Args:
-        value: a dataclass.
-    """
-    return {name: list(one) if isinstance(one, tuple) else one for name, one in dataclasses.asdict(value).items()}
 
 
 def _print(text: str) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from scenarios.limits import MILLISECONDS, TITLES, Limit
 from scenarios.run_comparison import FlightChange, MetricChange, RunChange
 from scenarios.run_text import printable
+from scenarios.table import text_console
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -94,19 +95,8 @@ def comparison_text(changes: Sequence[RunChange], *, width: int, colour: bool) -
     Args:
         changes: each run's, compared with the first. width: columns. colour: with ANSI colours.
     """
-    from rich.console import Console
-
     sink = io.StringIO()
-    console = Console(
-        file=sink,
-        width=width,
-        force_terminal=colour,
-        color_system="standard" if colour else None,
-        highlight=False,
-        emoji=False,
-        markup=False,
-        legacy_windows=False,
-    )
+    console = text_console(sink, width, colour=colour)
     for number, change in enumerate(changes):
         if number:
             console.print()

@@ -11,11 +11,14 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from scenarios.flight import FlightRecord, RunRecord
 from scenarios.gain_set import flies_gains
 from scenarios.limits import LIMIT_CYCLE_RAD_S, Outcome
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 UNSET = "–"
 MINIMUM_WIDTH = 80
@@ -190,6 +193,26 @@ def _plain(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
+def text_console(sink: TextIO, width: int, *, colour: bool) -> Console:
+    """A console that writes text as it is, whatever the terminal.
+
+    Args:
+        sink: where to. width: columns. colour: with ANSI colours.
+    """
+    from rich.console import Console
+
+    return Console(
+        file=sink,
+        width=width,
+        force_terminal=colour,
+        color_system="standard" if colour else None,
+        highlight=False,
+        emoji=False,
+        markup=False,
+        legacy_windows=False,
+    )
+
+
 def run_text(
     run: RunRecord,
     folder: Path | None = None,
@@ -213,20 +236,9 @@ def run_text(
     """
     import io
 
-    from rich.console import Console
-
     columns = max(width or PIPED_WIDTH, MINIMUM_WIDTH)
     sink = io.StringIO()
-    console = Console(
-        file=sink,
-        width=columns,
-        force_terminal=colour,
-        color_system="standard" if colour else None,
-        highlight=False,
-        emoji=False,
-        markup=False,
-        legacy_windows=False,
-    )
+    console = text_console(sink, columns, colour=colour)
     console.print(_rich_table(run.flights, columns))
     for flight in run.flights:
         for index, note in enumerate(notes(flight)):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from scenarios.gain_set import load_gain_sets
 from scenarios.markdown import ROLL_GAINS
@@ -36,6 +36,7 @@ MOST_SEGMENTS = 4
 """So many steps and so many tracks are drawn; of the others the table tells."""
 
 Telemetries = Mapping[int, "Telemetry | None"]
+Trace = TypeVar("Trace")
 
 
 def numbers_section(sets: Sets) -> Section:
@@ -87,12 +88,7 @@ def step_sections(sets: Sets, telemetry: Telemetries) -> list[Section]:
     names = segments_of((one.data for one in sets.all), "step")
     made = []
     for place, name in enumerate(names[:MOST_SEGMENTS]):
-        drawn = []
-        for one in sets.all:
-            rows = telemetry.get(one.number)
-            trace = None if rows is None else step_trace(one.data, rows, name)
-            if trace is not None:
-                drawn.append((one, trace))
+        drawn = _traced(sets, telemetry, name, step_trace)
         lead = [
             "Roll over time from the moment the set-point stepped, in the direction of the step. Grey line: the "
             "set-point; band: 5 % of the step around it; dotted: 2 %."
@@ -125,6 +121,22 @@ def step_sections(sets: Sets, telemetry: Telemetries) -> list[Section]:
     return made
 
 
+def _traced(
+    sets: Sets,
+    telemetry: Telemetries,
+    name: str,
+    trace_of: Callable[[Mapping[str, Any], Telemetry, str], Trace | None],
+) -> list[tuple[Set, Trace]]:
+    """The gain sets that flew a segment, each with what it did there."""
+    found = []
+    for one in sets.all:
+        rows = telemetry.get(one.number)
+        trace = None if rows is None else trace_of(one.data, rows, name)
+        if trace is not None:
+            found.append((one, trace))
+    return found
+
+
 def track_sections(sets: Sets, telemetry: Telemetries) -> list[Section]:
     """Every track: set-point and roll of each gain set, and the numbers."""
     import numpy as np
@@ -132,12 +144,7 @@ def track_sections(sets: Sets, telemetry: Telemetries) -> list[Section]:
     names = segments_of((one.data for one in sets.all), "track")
     made = []
     for place, name in enumerate(names[:MOST_SEGMENTS]):
-        drawn = []
-        for one in sets.all:
-            rows = telemetry.get(one.number)
-            trace = None if rows is None else track_trace(one.data, rows, name)
-            if trace is not None:
-                drawn.append((one, trace))
+        drawn = _traced(sets, telemetry, name, track_trace)
         if not drawn:
             made.append(Section(f"track-{place}", _heading("Tracking", name, names), _nothing_recorded()))
             continue
