@@ -6,22 +6,18 @@ value of the whole, is what `scenarios.score` does with telemetry. NaN stands fo
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from queue import SimpleQueue
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from scenarios import batch_metrics as lanes
-from scenarios.batch_tracking import TRACK
-from scenarios.manoeuvres import EPSILON_S, Manoeuvre, Window
-from scenarios.metrics import effort_metrics, oscillation, step_metrics, track_metrics
+from scenarios.batch_flight import WorstOf, setpoint_ticks
+from scenarios.manoeuvres import Manoeuvre
 from scenarios.roll_set import RollSet, roll_sets
 from sitl.batch import Batch, Block, RollJob
 from sitl.control_loop import CONTROL_SETTINGS
@@ -43,9 +39,6 @@ TRACES_BYTES = 4e9
 
 SETPOINT_RATE_HZ = 50.0
 """What a scenario sends its set-points at unless it says otherwise."""
-
-LOWEST_IS_WORST = ("vaf_pct", "vaf_lag_removed_pct")
-LARGEST_MAGNITUDE_IS_WORST = ("droop_deg",)
 
 
 @dataclass(frozen=True)
@@ -154,15 +147,15 @@ def monte_carlo(
     if derivatives is None:
         derivatives = draw_samples(model, samples, seed, distribution, spread_sigma)
     lag_s = profile.motor_lag(model.assumptions.motor_lag_s)
-    signals = [_ticks(manoeuvre, profile, setpoint_rate_hz) for manoeuvre in manoeuvres]
+    signals = [setpoint_ticks(manoeuvre, profile, setpoint_rate_hz) for manoeuvre in manoeuvres]
     kept = _Kept(signals, len(sets), len(derivatives), trace_every, profile.dt_s) if trace_every else None
-    worst = _Worst(len(sets), len(derivatives))
+    worst = WorstOf(len(sets), len(derivatives))
     settings = np.zeros(len(sets), CONTROL_SETTINGS)
     for number, one in enumerate(sets):
         settings[number] = one.settings
     workers = threads or os.cpu_count() or 1
     with ThreadPoolExecutor(workers) as pool:
-        found = pool.submit(_margins, derivatives, sets, lag_s) if margins else None
+        found = pool.submit(margins_of, derivatives, sets, lag_s) if margins else None
         matrices = None
         for number, (manoeuvre, signal) in enumerate(zip(manoeuvres, signals, strict=True)):
             job = RollJob(
@@ -171,8 +164,7 @@ def monte_carlo(
             batch = Batch(job, compiled, matrices)
             matrices = batch.matrices
             keep = None if kept is None else partial(kept.add, number)
-            for flown in _fly(batch, manoeuvre, signal, profile.dt_s, pool, workers, keep):
-                worst.add(flown)
+            worst.fly(batch, manoeuvre, profile.dt_s, pool, workers, keep)
         margin_arrays = found.result() if found is not None else None
     traces = None if kept is None else kept.traces
     return MonteCarlo(tuple(gains), derivatives, worst.metrics(), margin_arrays, worst.diverged, traces)
@@ -208,16 +200,12 @@ class _Kept:
             into[place] = flown[:: self._every].T
 
 
-def _ticks(manoeuvre: Manoeuvre, profile: Profile, setpoint_rate_hz: float) -> FloatArray:
-    """Roll set-point of every tick: sent at its own rate and held."""
-    sent = manoeuvre.samples(setpoint_rate_hz)
-    ticks = np.arange(round(manoeuvre.duration_s * profile.rate_hz))
-    held = np.floor(ticks / profile.rate_hz * setpoint_rate_hz + EPSILON_S * setpoint_rate_hz).astype(int)
-    return np.asarray(sent[np.minimum(held, len(sent) - 1)])
+def margins_of(derivatives: FloatArray, sets: Sequence[RollSet], lag_s: float) -> MarginArrays:
+    """Margins of every set on every sample, (G, S); sets that share their filters together.
 
-
-def _margins(derivatives: FloatArray, sets: Sequence[RollSet], lag_s: float) -> MarginArrays:
-    """Margins of every set, those that share their filters together."""
+    Args:
+        derivatives: (S, 6). sets: gain sets. lag_s: of the motors.
+    """
     from dataclasses import fields
 
     from sitl.margin_batch import MarginArrays, batch_margins
@@ -234,129 +222,3 @@ def _margins(derivatives: FloatArray, sets: Sequence[RollSet], lag_s: float) -> 
     return MarginArrays(
         **{f.name: np.stack([getattr(rows[g], f.name) for g in range(len(sets))]) for f in fields(MarginArrays)}
     )
-
-
-@dataclass(frozen=True)
-class _Flown:
-    """What is left of a block: which pairs it was, (n,) each, which were lost, and the metrics of every window."""
-
-    gain_set: npt.NDArray[np.intp]
-    sample: npt.NDArray[np.intp]
-    lost: BoolArray
-    windows: list[Mapping[str, FloatArray]]
-
-
-def _fly(
-    batch: Batch,
-    manoeuvre: Manoeuvre,
-    signal: FloatArray,
-    dt_s: float,
-    pool: ThreadPoolExecutor,
-    workers: int,
-    keep: Callable[[Block], None] | None,
-) -> Iterator[_Flown]:
-    """Blocks in order, a few ahead of the reader at a time: memory does not grow with the job."""
-    measure = _measure_lanes if batch.compiled else _measure_each
-    rooms: SimpleQueue[FloatArray] = SimpleQueue()
-    for _ in range(workers):
-        rooms.put(np.empty(batch.room))
-
-    def one(number: int) -> _Flown:
-        room = rooms.get()
-        try:
-            block = batch.fly(number, room)
-            if keep is not None:
-                keep(block)
-            windows = [measure(block, window, signal, dt_s) for window in manoeuvre.windows]
-            return _Flown(block.gain_set, block.sample, block.lost, windows)
-        finally:
-            rooms.put(room)
-
-    ahead = 2 * workers
-    waiting = [pool.submit(one, n) for n in range(min(ahead, len(batch.blocks)))]
-    for n in range(len(batch.blocks)):
-        done = waiting.pop(0).result()
-        if n + ahead < len(batch.blocks):
-            waiting.append(pool.submit(one, n + ahead))
-        yield done
-
-
-def _rows(window: Window, dt_s: float) -> slice:
-    return slice(round(window.start_s / dt_s), round(window.end_s / dt_s))
-
-
-def _measure_lanes(block: Block, window: Window, signal: FloatArray, dt_s: float) -> Mapping[str, FloatArray]:
-    rows = _rows(window, dt_s)
-    phi = block.phi_rad[rows]
-    found: dict[str, FloatArray] = {}
-    if window.kind == "step":
-        steps = lanes.measure_step(phi, dt_s, window.phi_from_rad, window.phi_to_rad)
-        found |= dict(zip(lanes.STEP, steps, strict=True))
-    elif window.kind == "track":
-        found |= dict(zip(TRACK, lanes.measure_track(phi, signal[rows], dt_s), strict=True))
-    if window.kind in ("step", "hold"):
-        found["oscillation_rad_s"] = lanes.measure_oscillation(block.p_rad_s[rows], dt_s)
-    return found | dict(zip(lanes.EFFORT, lanes.measure_effort(block.delta_lat[rows]), strict=True))
-
-
-def _measure_each(block: Block, window: Window, signal: FloatArray, dt_s: float) -> Mapping[str, FloatArray]:
-    """The same by `scenarios.metrics`, one flight after the other: nothing to compile."""
-    rows = _rows(window, dt_s)
-    t = np.arange(rows.start, rows.stop) * dt_s
-    start, end = window.start_s, window.end_s
-    level = np.zeros(len(t))
-    found: dict[str, FloatArray] = {}
-    for j in range(len(block.lost)):
-        phi = block.phi_rad[rows, j]
-        metrics = effort_metrics(t, block.delta_lat[rows, j], start_s=start, end_s=end)
-        if window.kind == "step":
-            before, after = window.phi_from_rad, window.phi_to_rad
-            metrics += step_metrics(t, phi, start_s=start, end_s=end, phi_from_rad=before, phi_to_rad=after)
-        elif window.kind == "track":
-            metrics += track_metrics(t, phi, signal[rows], start_s=start, end_s=end)
-        for metric in metrics:
-            row = found.setdefault(metric.name, np.full(len(block.lost), math.nan))
-            row[j] = math.nan if metric.value is None else metric.value
-        if window.kind in ("step", "hold"):
-            shake = oscillation(t, block.p_rad_s[rows, j], level, level, start_s=start, end_s=end)
-            found.setdefault("oscillation_rad_s", np.full(len(block.lost), math.nan))[j] = shake.worst_rad_s
-    return found
-
-
-class _Worst:
-    """The whole's value of each metric: that of its worst segment; NaN if any segment has none."""
-
-    def __init__(self, sets: int, samples: int) -> None:
-        self._values: dict[str, FloatArray] = {}
-        self._shape = (sets, samples)
-        self.diverged: BoolArray = np.zeros(self._shape, dtype=bool)
-
-    def add(self, flown: _Flown) -> None:
-        place = flown.gain_set, flown.sample
-        self.diverged[place] |= flown.lost
-        for metrics in flown.windows:
-            for name, value in metrics.items():
-                if name not in self._values:
-                    self._values[name] = np.full(self._shape, -math.inf)
-                self._values[name][place] = _worse(name, self._values[name][place], value)
-
-    def metrics(self) -> dict[str, FloatArray]:
-        cycles = lanes.is_limit_cycle(self._values.get("oscillation_rad_s", np.full(self._shape, math.nan)))
-        found = {}
-        for name, value in self._values.items():
-            unset = self.diverged | ~np.isfinite(value)
-            if name in lanes.STEP[:4]:
-                unset |= cycles
-            found[name] = np.where(unset, math.nan, value)
-        return found
-
-
-def _worse(name: str, held: FloatArray, new: FloatArray) -> FloatArray:
-    """The worse of two segments' values; `held` is -inf before the first. A window too short to tell is passed over."""
-    if name == "oscillation_rad_s":
-        return np.fmax(held, new)
-    if name in LOWEST_IS_WORST:
-        return np.where(np.isneginf(held), new, np.minimum(held, new))
-    if name in LARGEST_MAGNITUDE_IS_WORST:
-        return np.where(np.isneginf(held) | (np.abs(new) > np.abs(held)) | np.isnan(new), new, held)
-    return np.maximum(held, new)

@@ -285,11 +285,14 @@ class Batch:
 
 def _alike(settings: npt.NDArray[np.void]) -> list[IndexArray]:
     """Numbers of the gain sets that differ in their roll gains alone."""
-    # field by field: what lies between the fields of a record is not ours
-    rest = [settings[name] for name in settings.dtype.names or () if name not in GAINS]
+    # into zeros: what lies between the fields of a record is not ours
+    rest = np.zeros(len(settings), settings.dtype)
+    for name in settings.dtype.names or ():
+        if name not in GAINS:
+            rest[name] = settings[name]
     groups: dict[bytes, list[int]] = {}
-    for number in range(len(settings)):
-        groups.setdefault(b"".join(field[number].tobytes() for field in rest), []).append(number)
+    for number, row in enumerate(rest):
+        groups.setdefault(row.tobytes(), []).append(number)
     return [np.array(members) for members in groups.values()]
 
 
