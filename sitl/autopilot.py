@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl.commander import Commander
+from sitl.failsafe import Action
 from sitl.flight_control import FlightControl
 from sitl.guide import ATTITUDE_BY_STICK
+from sitl.land_detector import LandDetector
 from sitl.landing_watch import land_limits
 from sitl.modes import LandedState, Mode
 from sitl.navigator import Navigator
@@ -145,6 +147,18 @@ class Autopilot(Commander):
         value = max(0.0, min(1.0, value)) if math.isfinite(value) else 0.0
         seconds = max(0.0, min(LONGEST_TEST_S, seconds)) if math.isfinite(seconds) else 0.0
         self._tested = (motor, value, self._now_us + round(seconds * 1e6))
+
+    def restart(self) -> None:
+        """Boot anew, wherever the vehicle is: disarmed, motors off, nothing known but the parameters."""
+        self._booted_us = self._now_us
+        self.armed = self.terminated = self.failsafe = self.healthy = False
+        self._tilt_warned = self._told_why = False
+        self._home_here = True
+        self.home = self._offboard_us = self._takeoff_amsl_m = self._tested = None
+        self._action = Action.NONE
+        self.mode = self.intended = self._after_disarming = Mode.LOITER
+        self.land_detector = LandDetector()
+        self.control.restart()
 
     # -- every tick --------------------------------------------------------------------------------------------
 

@@ -11,6 +11,7 @@ import numpy as np
 from sitl.actuators import MAX_MOTORS
 from sitl.control_settings import mix_of
 from sitl.errors import UsageError
+from sitl.faults import Faults
 from sitl.geomagnetism import earth_field_gauss
 from sitl.parameters import ParameterTable
 from sitl.plant import Plant
@@ -134,6 +135,7 @@ class Body:
             field_gauss=self._field_gauss,
             gps_period_us=self._gps_period_us,
         )
+        self.faults = Faults(self.plant, self.sensors, self.seed)
         self.truth = Truth(self.plant)
         self._fixes: deque[tuple[int, Gps]] = deque()
         self._last_fix_us = self.sensors.gps().time_us

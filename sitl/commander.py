@@ -22,7 +22,7 @@ from sitl.sensors import ORIGIN, geodetic, local_position
 from sitl.setpoints import Reposition
 
 READY_US = 2_000_000
-"""Vehicle time until sensors and estimator count as healthy, us."""
+"""Time from boot until sensors and estimator count as healthy, us."""
 
 _WISHFUL = frozenset({Mode.TAKEOFF, Mode.VTOL_TAKEOFF, Mode.MISSION})
 """Modes that want another when they are done."""
@@ -64,7 +64,7 @@ class Commander:
         self._landing = LandingWatch(parameters)
         self._tilt = TiltDetector(parameters)
         self._failsafe = Failsafe(parameters)
-        self._now_us = 0
+        self._now_us = self._booted_us = 0
         self._armed_us = 0
         self._after_disarming = Mode.LOITER
         self._texts: list[Text] = []
@@ -254,10 +254,11 @@ class Commander:
         """Wait for the estimator; why one has to is said once."""
         if self.home is None:
             self._set_home()
-        if not self._told_why and self._now_us >= _TELL_WHY_US:
+        running_us = self._now_us - self._booted_us
+        if not self._told_why and running_us >= _TELL_WHY_US:
             self._told_why = True
             self.say(Severity.CRITICAL, f"Preflight Fail: {self._health_problem()}")
-        if self._now_us >= READY_US:
+        if running_us >= READY_US:
             self.healthy = True
             self._set_home()
 

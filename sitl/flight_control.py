@@ -102,6 +102,15 @@ class FlightControl:
         self._held_quat = self._position_state["quat_sp"][0]
         self._held_thrust = self._position_state["thrust_sp"]
 
+    def restart(self) -> None:
+        """Begin anew, motors off: filters, integrators and set-points are as at boot."""
+        self.state[:] = np.zeros(1, CONTROL_STATE)
+        self.stop()
+        self.set_landed(True)
+        self.forget_setpoint()
+        self.forget_position()
+        self.navigator.on_disarm()
+
     # -- what it is told ---------------------------------------------------------------------------------------
 
     @property

@@ -17,6 +17,7 @@ in steps of at most 1 ms.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +55,9 @@ PLANT_SETTINGS = np.dtype(
         ("delay_ticks", "i8"),
         ("steps", "i8"),
         ("step_s", "f8"),
+        ("gust_m_s2", "f8"),
+        ("gust_rad_s2", "f8"),
+        ("gusts", "?"),
         ("linear", "?"),
     ],
     align=True,
@@ -115,6 +119,9 @@ def _derivative(s: Record, x: Floats, d: Floats, dx: Floats, force: Floats) -> b
     dx[10] = s.Lv * v + s.Lp * p + s.Ld * d[0]
     dx[11] = -s.Lv * u + s.Lp * q + s.Ld * d[1]
     dx[12] = -s.yaw_damping * r + s.yaw_gain * d[2]
+    if s.gusts:
+        force[1] += s.gust_m_s2
+        dx[10] += s.gust_rad_s2
     depth = x[2] + _REST
     contact: bool = depth > 0.0
     if contact:
@@ -274,6 +281,8 @@ class Plant:
         if not 0 <= delay_ticks <= MAX_DELAY_TICKS:
             raise ValueError(f"delay_ticks is {delay_ticks}, want 0..{MAX_DELAY_TICKS}")
         self.tick = 0
+        self.weaken: Callable[[Floats], Floats] | None = None
+        """What faults of motors and battery make of the commands; None while there are none."""
         self.settings = np.zeros(1, PLANT_SETTINGS)
         self.state = np.zeros(1, PLANT_STATE)
         for name, value in derivatives.as_dict().items():
@@ -317,12 +326,26 @@ class Plant:
         self.settings["steps"] = steps
         self.settings["step_s"] = tick_us * 1e-6 / steps
 
+    def set_delay(self, ticks: int) -> None:
+        """Let commands act later or sooner from here on; those that have acted already stay meanwhile.
+
+        Args:
+            ticks: between a command and its motor, 0..64.
+        """
+        before = int(self.settings["delay_ticks"][0])
+        if ticks != before:
+            queue = self.state["queue"][0]
+            queue[before + 1 : ticks + 1] = queue[before]
+            self.settings["delay_ticks"] = ticks
+
     def step(self, commands: Floats) -> None:
         """Move by one tick.
 
         Args:
             commands: (12,) motor signals, fraction of full thrust, held over the tick.
         """
+        if self.weaken is not None:
+            commands = self.weaken(commands)
         plant_tick(self.settings, self.state, commands)
         self.tick += 1
 

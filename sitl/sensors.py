@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,16 @@ class Gps:
     epv_m: float = 0.4
     satellites: int = 12
     fix_type: int = 3
+
+
+class GyroError(Protocol):
+    """What faults make of a sample of the gyro; asked for once per sample."""
+
+    def added(self) -> NDArray[np.float64]:
+        """(3,) added to the true rates, rad/s."""
+
+    def lost(self) -> NDArray[np.bool_]:
+        """(3,) True where the sample does not come and the one before stands."""
 
 
 def geodetic(
@@ -127,6 +138,8 @@ class Sensors:
         self._gps_period_us = gps_period_us
         self._next_gps_us = 0
         self.gyro = np.zeros(3)
+        self.gyro_fault: GyroError | None = None
+        """What is wrong with the gyro; None while nothing is."""
         self._gps = Gps(0, *origin, (0.0, 0.0, 0.0))
 
     def sample(self, now_us: int) -> None:
@@ -139,7 +152,14 @@ class Sensors:
         if self._row >= _BLOCK:
             self._noise = self._rng.standard_normal((_BLOCK, 10)) * self._scale
             self._row = 0
-        measure_gyro(self._plant.rates, self._noise, self._row, self._profile.gyro_quantum_rad_s, self.gyro)
+        quantum = self._profile.gyro_quantum_rad_s
+        if self.gyro_fault is None:
+            measure_gyro(self._plant.rates, self._noise, self._row, quantum, self.gyro)
+        else:
+            before, lost = self.gyro.copy(), self.gyro_fault.lost()
+            rates = self._plant.rates + self.gyro_fault.added()
+            measure_gyro(rates, self._noise, self._row, quantum, self.gyro)
+            self.gyro[lost] = before[lost]
         if now_us >= self._next_gps_us:
             # from now, not from zero: sensors may begin late, and must not make up for fixes nobody saw
             self._next_gps_us = now_us - now_us % self._gps_period_us + self._gps_period_us

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from sitl.autopilot import Autopilot
 from sitl.control_settings import mix_of
+from sitl.faults import Faults
 from sitl.parameters import ParameterTable
 from sitl.plant import Plant
 from sitl.profile import Profile
@@ -125,6 +126,9 @@ class Vehicle:
         seed: of the sensor noise.
         parameters: a table to start from; by default PX4's defaults with the airframe's geometry and the profile's
             filter cutoffs.
+
+    Attributes:
+        faults: what is wrong with plant, battery and sensors.
     """
 
     def __init__(
@@ -155,6 +159,7 @@ class Vehicle:
         self.autopilot = Autopilot(self.parameters, profile, self.plant, self._sensors)
         self.truth = Truth(self.plant)
         self.estimate = Estimate(self.plant, self.autopilot, self._sensors)
+        self.faults = Faults(self.plant, self._sensors, seed)
         self._commands = self.autopilot.tick(0)
 
     @property
@@ -177,7 +182,7 @@ class Vehicle:
     def battery(self) -> Battery:
         """A battery that never empties."""
         load = sum(self.autopilot.motors)
-        return Battery(voltage_v=16.2 - 0.05 * load, current_a=5.0 * load, remaining=1.0)
+        return Battery(voltage_v=(16.2 - 0.05 * load) * self.faults.voltage, current_a=5.0 * load, remaining=1.0)
 
 
 def airframe_parameters(model: VehicleModel, profile: Profile) -> dict[str, float | int]:
