@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
 
@@ -38,6 +38,16 @@ _EFFORT = slice(_SHAKE.stop, _SHAKE.stop + len(lanes.EFFORT))
 _HIGHEST, _LOWEST, _LARGEST, _KNOWN = range(4)
 _SENSE = {"vaf_pct": _LOWEST, "vaf_lag_removed_pct": _LOWEST, "droop_deg": _LARGEST, "oscillation_rad_s": _KNOWN}
 _SENSES = np.array([_SENSE.get(name, _HIGHEST) for name in MEASURED])
+
+
+def metrics_of(manoeuvres: Sequence[Manoeuvre]) -> tuple[str, ...]:
+    """Names of what is measured on manoeuvres, in the order of MEASURED.
+
+    Args:
+        manoeuvres: in any order.
+    """
+    rows = {row for one in manoeuvres for window in one.windows for part in _rows_of(window.kind) for row in _span(part)}
+    return tuple(MEASURED[row] for row in sorted(rows))
 
 
 def setpoint_ticks(manoeuvre: Manoeuvre, profile: Profile, setpoint_rate_hz: float) -> FloatArray:
@@ -116,9 +126,7 @@ class WorstOf:
         """
         measure = _measure_lanes if batch.compiled else _measure_each
         signal = batch.job.phi_sp_rad
-        for window in manoeuvre.windows:
-            for rows in _rows_of(window.kind):
-                self._measured.update(range(rows.start, rows.stop))
+        self._measured.update(MEASURED.index(name) for name in metrics_of([manoeuvre]))
 
         def one(number: int, room: FloatArray) -> None:
             block = batch.fly(number, room)
@@ -183,6 +191,10 @@ def _rows_of(kind: str) -> list[slice]:
     """Rows of what a window of a kind measures."""
     of_kind = {"step": [_STEP, _SHAKE], "track": [_TRACK], "hold": [_SHAKE]}
     return [*of_kind.get(kind, []), _EFFORT]
+
+
+def _span(rows: slice) -> range:
+    return range(rows.start, rows.stop)
 
 
 def _rows(window: Window, dt_s: float) -> slice:

@@ -13,6 +13,7 @@ from typing import NoReturn
 from scenarios import analyse_command, fly_command, hil_command, restore_command, review_command, sitl_command
 from scenarios.identification import identify_command
 from scenarios.study import study_command
+from scenarios.sweep import sweep_command
 from scenarios.tuning import tune_command
 
 EXIT_OK, EXIT_GATE, EXIT_USAGE, EXIT_LINK, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
@@ -96,6 +97,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     analyse_command.add_arguments(sub)
     _vehicle_options(sub)
+
+    sub = add(
+        "sweep",
+        _sweep,
+        "Judge thousands of gain sets over uncertain models, on one machine or a cluster; resumable.",
+        "froude sweep my_sweep.toml --fly 5",
+    )
+    sweep_command.add_arguments(sub)
 
     sub = add(
         "tune",
@@ -247,6 +256,10 @@ def _analyse(args: argparse.Namespace) -> int:
     from sitl.vehicle_spec import DEFAULT_SCALING
 
     return analyse_command.run(args, scaling=_words(args.scaling, DEFAULT_SCALING), seed=_seed(args), tell=_tell)
+
+
+def _sweep(args: argparse.Namespace) -> int:
+    return sweep_command.run(args, tell=_tell)
 
 
 def _tune(args: argparse.Namespace) -> int:

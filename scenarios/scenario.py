@@ -143,16 +143,12 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
     file = KeyedTable(path, data)
     profile, overrides = _profile(file, data)
     rate_hz = file.number("setpoint_rate_hz", 50.0, at_least=5.0, at_most=500.0)
-    limits_key = "limit" if "limit" in file else "limits"
-    if limits_key == "limit" and "limits" in file:
-        raise file.error("limit", "the file has limits, too", "Name a limit set or list your own, not both")
-    limits_value = data.get(limits_key, "practical")
-    file.text("limits", "practical") if limits_key == "limits" else file.tables("limit")
+    limits, limits_name = read_limits(file)
     manoeuvres = parse_manoeuvres(data["manoeuvre"] if "manoeuvre" in file else None, path, rate_hz)
     scenario = Scenario(
         name=path.stem,
         title=file.text("title", path.stem),
-        vehicle=":".join(_beside(path, part) for part in file.text("vehicle", "ant-x").split(":")),
+        vehicle=":".join(beside(path, part) for part in file.text("vehicle", "ant-x").split(":")),
         scaling=file.texts("scaling") if "scaling" in file else ("derivatives",),
         profile=profile,
         overrides=overrides,
@@ -161,10 +157,10 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
         takeoff_altitude_m=file.number("takeoff_altitude_m", 10.0, at_least=2.0, at_most=500.0),
         setpoint_rate_hz=rate_hz,
         seed=_whole(file, "seed", 0),
-        gain_sets=tuple(_beside(path, ref) for ref in file.texts("gain_sets")),
+        gain_sets=tuple(beside(path, ref) for ref in file.texts("gain_sets")),
         manoeuvres=manoeuvres,
-        limits=parse_limits(limits_value, path, limits_key),
-        limits_name=limits_value if isinstance(limits_value, str) else "custom",
+        limits=limits,
+        limits_name=limits_name,
         gate=_gate(file),
         path=path,
     )
@@ -174,6 +170,24 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
     except UsageError as error:
         raise FileError(path, str(error)) from error
     return scenario
+
+
+def read_limits(file: KeyedTable) -> tuple[tuple[Limit, ...], str]:
+    """The limits of a file, `limits = "practical"` or its own [[limit]], and the name of the set ("custom").
+
+    Args:
+        file: a scenario's or a sweep's.
+
+    Raises:
+        FileError: both, or as `parse_limits`.
+    """
+    key = "limit" if "limit" in file else "limits"
+    if key == "limit" and "limits" in file:
+        raise file.error("limit", "the file has limits, too", "Name a limit set or list your own, not both")
+    if key == "limit":
+        file.tables(key)
+    value = file.anything(key) if key in file else "practical"
+    return parse_limits(value, file.path, key), value if isinstance(value, str) else "custom"
 
 
 def limit_set(name: str) -> tuple[Limit, ...]:
@@ -196,7 +210,7 @@ def _find(name_or_path: str | Path) -> Path:
     raise FileError(name_or_path, f"no such scenario{nearest(str(name_or_path), known)}", hint)
 
 
-def _beside(scenario: Path, ref: str) -> str:
+def beside(scenario: Path, ref: str) -> str:
     """A file named in a scenario is looked for beside it first; anything else is left as it is."""
     folder = scenario.parent
     here = any(part and (folder / part).is_file() for part in (ref, ref.rpartition("/")[0]))

@@ -78,6 +78,19 @@ class KeyedTable:
             raise self.error(key, f"missing key{here}", "Add it")
         return self._values[key]
 
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Every key of the table, in the file's order."""
+        return tuple(self._values)
+
+    def anything(self, key: str) -> Any:
+        """The value of a key, of whatever kind.
+
+        Raises:
+            FileError: missing.
+        """
+        return self._take(key)
+
     def number(
         self,
         key: str,

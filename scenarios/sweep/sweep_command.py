@@ -1,0 +1,152 @@
+"""`froude sweep`: thousands of gain sets judged over uncertain models, resumable; and a look at what came out."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from scenarios.sweep.dataset import Dataset
+    from scenarios.sweep.engines import Engine
+    from scenarios.sweep.plan import Plan
+    from scenarios.sweep.sweeping import Progress
+
+EXIT_OK, EXIT_GATE = 0, 1
+NEWEST = "newest"
+SMALL_STEPS = 400_000_000
+"""Vehicle-steps that are flown in this process while processes of their own would still be starting."""
+
+Tell = Callable[[str], object]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `froude sweep`."""
+    add = parser.add_argument
+    add("sweep", nargs="?", metavar="SWEEP.toml", help="axes, design, manoeuvres and limits; see the README")
+    add("--out", metavar="DIR", default="logs", help="folder that the sweep's folder is made in (default: logs)")
+    add(
+        "--resume",
+        nargs="?",
+        const=NEWEST,
+        metavar="DIR",
+        help="go on with a sweep that was stopped: its folder, or the newest of SWEEP.toml",
+    )
+    add("--show", nargs="?", const=NEWEST, metavar="DIR", help="show a sweep: its folder, or the newest")
+    add("--jobs", type=int, default=0, metavar="N", help="workers (default: one a core)")
+    add("--engine", choices=("auto", "in-process", "processes"), default="auto", help="who works (default: by size)")
+    add("--fly", type=int, default=0, metavar="K", help="fly the best K candidates over MAVLink in every condition")
+    add("--px4", metavar="DIR", help="fly them with a real PX4, too: its build directory")
+    add("--json", action="store_true", help="for machines")
+    add("--gate", action="store_true", help="exit status 1 if no candidate passes everywhere")
+
+
+def run(args: argparse.Namespace, *, tell: Tell) -> int:
+    """Sweep, go on, or show.
+
+    Args:
+        args: the parsed arguments. tell: prints a line for people on standard error.
+
+    Returns:
+        exit status: 0, or 1 with --gate where nothing passes everywhere.
+
+    Raises:
+        UsageError, FileError: before any work: a bad file, folder or number.
+        LinkError: a cluster that does not answer.
+    """
+    from sitl.errors import UsageError
+
+    if args.show is not None:
+        if args.sweep is not None and args.show == NEWEST and Path(args.sweep).is_dir():
+            args.show, args.sweep = args.sweep, None
+        if args.sweep is not None or args.resume is not None:
+            raise UsageError("--show looks at what is there: leave out SWEEP.toml and --resume")
+        return _show(_folder(args.show, Path(args.out), ""), args, tell)
+    if args.sweep is None and args.resume is None:
+        raise UsageError("give a SWEEP.toml, --resume to go on with a sweep, or --show to look at one")
+    if args.jobs < 0:
+        raise UsageError(f"--jobs {args.jobs}: give 1 or more")
+    if args.fly < 0:
+        raise UsageError(f"--fly {args.fly}: give 0 or more")
+    if args.px4 is not None and not args.fly:
+        raise UsageError("--px4 flies the best: say how many with --fly K")
+    plan, dataset = _begin(args, tell)
+    for warning in plan.warnings:
+        tell(warning)
+    _work(plan, dataset, args, tell)
+    return _show(dataset.path, args, tell)
+
+
+def _begin(args: argparse.Namespace, tell: Tell) -> tuple[Plan, Dataset]:
+    """The plan, and the folder that it is kept in: a new one, or the one to go on with."""
+    from bridge.clock import utc_stamp
+    from scenarios.sweep.dataset import Dataset
+    from scenarios.sweep.plan import make_plan
+    from scenarios.sweep.program import program_facts
+    from scenarios.sweep.resuming import plan_of
+    from scenarios.sweep.sweep_file import load_sweep
+
+    if args.resume is not None:
+        name = Path(args.sweep).stem if args.sweep else ""
+        dataset = Dataset(_folder(args.resume, Path(args.out), name))
+        plan = plan_of(dataset, Path(args.sweep) if args.sweep else None)
+        return plan, dataset
+    plan = make_plan(load_sweep(Path(args.sweep)))
+    stamp = utc_stamp()
+    path = Path(args.out) / f"{stamp}_sweep_{plan.sweep.name}"
+    attempt = 1
+    while path.exists():
+        attempt += 1
+        path = path.with_name(f"{stamp}_sweep_{plan.sweep.name}_{attempt}")
+    dataset = Dataset(path)
+    dataset.create(plan, {"started_utc": stamp, "command": list(args.argv), **program_facts()})
+    return plan, dataset
+
+
+def _folder(named: str, base: Path, name: str) -> Path:
+    """The folder of a sweep: as named, or the newest below `base` of that name."""
+    from scenarios.sweep.dataset import SWEEP_JSON
+    from sitl.errors import FileError
+
+    if named != NEWEST:
+        return Path(named)
+    found = sorted(path.parent for path in base.glob(f"*_sweep_{name or '*'}/{SWEEP_JSON}"))
+    if not found:
+        raise FileError(
+            base, f"holds no sweep{f' of {name}.toml' if name else ''}", "Start one: froude sweep SWEEP.toml"
+        )
+    return found[-1]
+
+
+def _engine(plan: Plan, args: argparse.Namespace) -> Engine:
+    from scenarios.sweep.engines import InProcess, Processes
+
+    small = plan.points * plan.steps_per_point < SMALL_STEPS
+    if args.engine == "in-process" or (args.engine == "auto" and small):
+        return InProcess(plan, args.jobs)
+    return Processes(plan, args.jobs)
+
+
+def _work(plan: Plan, dataset: Dataset, args: argparse.Namespace, tell: Tell) -> Progress:
+    from scenarios import interrupts
+    from scenarios.sweep.sweep_progress import watching
+    from scenarios.sweep.sweeping import sweep_points
+
+    with interrupts.caught(), dataset.locked(), _engine(plan, args) as engine:
+        try:
+            with watching(plan, engine, tell) as show:
+                return sweep_points(plan, dataset, engine, show)
+        except KeyboardInterrupt:
+            tell(f"stopped; what is done is kept. Go on with: froude sweep --resume {dataset.path}")
+            raise
+
+
+def _show(path: Path, args: argparse.Namespace, tell: Tell) -> int:
+    from scenarios.sweep.dataset import Dataset
+
+    found: dict[str, Any] = Dataset(path).facts()
+    sys.stdout.write(json.dumps({"folder": str(path), "points": found["points"]}) + "\n")
+    return EXIT_OK
