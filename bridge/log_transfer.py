@@ -5,6 +5,9 @@
   covered, so the last one may carry more than was asked; only the end of the file makes one shorter. An offset beyond
   the end or an unknown log is silence, and ends what was being sent.
 - A log that grows is served up to the size it had in the list.
+- Data is paced, and a whole log asked for at once comes more slowly than pieces that a client waits for. A PX4 sends as
+  fast as its line takes it, which overflows the socket of MAVProxy, and of the twenty pieces MAVProxy then asks for
+  together PX4 sends the last.
 - LOG_ERASE deletes all logs but the one being written. LOG_REQUEST_END stops.
 
 Source: PX4 src/modules/mavlink/mavlink_log_handler.cpp and answers recorded from a PX4 SITL of May 2026.
@@ -26,6 +29,11 @@ DATA_BYTES: Final = 90
 PERIOD_US: Final = 4_000
 """Least time between two bursts on one link, us."""
 
+WINDOW_BYTES: Final = 512 * DATA_BYTES
+"""Most that a client asks for at once that then waits for it: QGroundControl and MAVSDK."""
+PACED_BURST: Final = 5
+"""Most messages in a burst of more than that: MAVProxy on a busy computer reads 1250 in a second, and not 2000."""
+
 LIST_TO_END: Final = 0xFFFF
 _UINT32_MAX = 0xFFFFFFFF
 _RESCAN_US = 100_000
@@ -34,7 +42,9 @@ _RESCAN_US = 100_000
 class _LinkState:
     """What one link is told and still owed."""
 
-    __slots__ = ("burst", "due_us", "end", "file", "last", "log_id", "logs", "next_entry", "offset", "size", "top")
+    __slots__ = (
+        "burst", "due_us", "end", "file", "last", "log_id", "logs", "next_entry", "offset", "pace", "size", "top"
+    )  # fmt: skip
 
     def __init__(self, burst: int) -> None:
         self.burst = burst
@@ -48,6 +58,7 @@ class _LinkState:
         self.size = 0
         self.offset: int | None = None  # of the next LOG_DATA
         self.end = 0
+        self.pace = burst  # of the data being sent
 
     def stop(self) -> None:
         """Send nothing more."""
@@ -193,6 +204,7 @@ class LogServer:
             return
         link.offset = offset
         link.end = min(offset + msg["count"], link.size)
+        link.pace = link.burst if link.end - offset <= WINDOW_BYTES else min(link.burst, PACED_BURST)
 
     def _bytes(self, link: _LinkState) -> list[Outgoing]:
         offset, file = link.offset, link.file
@@ -203,7 +215,7 @@ class LogServer:
             # Just behind the end: an empty packet says that there is no more, which some readers wait for.
             link.stop()
             return [("LOG_DATA", {"id": link.log_id, "ofs": offset, "count": 0})]
-        packets = min(link.burst, -(-max(link.end - offset, 1) // DATA_BYTES))
+        packets = min(link.pace, -(-max(link.end - offset, 1) // DATA_BYTES))
         wanted = min(packets * DATA_BYTES, link.size - offset)
         try:
             os.lseek(file, offset, os.SEEK_SET)

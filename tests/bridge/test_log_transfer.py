@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from bridge.connection import Connection
 from bridge.log_store import create_log, find_logs
-from bridge.log_transfer import PERIOD_US, LogServer
+from bridge.log_transfer import PACED_BURST, PERIOD_US, WINDOW_BYTES, LogServer
 
 CASES = Path(__file__).parents[1] / "data" / "px4_answers.jsonl"
 
@@ -212,15 +212,28 @@ def test_pacing(tmp_path):
     write_log(tmp_path, bytes(90 * 1000))
     peer = Peer(tmp_path)
     peer.list()
-    peer.send("LOG_REQUEST_DATA", id=0, ofs=0, count=0xFFFFFFFF)
+    peer.send("LOG_REQUEST_DATA", id=0, ofs=0, count=WINDOW_BYTES)
     assert len(peer.server.poll(0, peer.now_us + PERIOD_US)) == 20
     for _ in range(5):  # traffic may bring further polls in the same instant
         assert peer.server.poll(0, peer.now_us + PERIOD_US) == []
     peer.server.add_link(0, burst=3)
     peer.list()
-    peer.send("LOG_REQUEST_DATA", id=0, ofs=0, count=0xFFFFFFFF)
-    peer.now_us += PERIOD_US
-    assert len(peer.server.poll(0, peer.now_us)) == 3
+    for count in (WINDOW_BYTES, 0xFFFFFFFF):
+        peer.send("LOG_REQUEST_DATA", id=0, ofs=0, count=count)
+        peer.now_us += PERIOD_US
+        assert len(peer.server.poll(0, peer.now_us)) == 3
+
+
+def test_a_whole_log_asked_for_at_once_comes_slowly_enough_to_be_read(tmp_path):
+    content = random.Random(5).randbytes(90 * 1000 + 17)
+    write_log(tmp_path, content)
+    peer = Peer(tmp_path)
+    peer.list()
+    packets = peer.data(0, 0, 0xFFFFFFFF, seconds=0.4)
+    assert len(packets) == 0.4e6 / PERIOD_US * PACED_BURST
+    packets += peer.hear(2.0)
+    assert b"".join(one.data[: one.count] for one in packets) == content
+    assert len(peer.data(0, 0, WINDOW_BYTES, seconds=0.1)) == 500, "a window is waited for, and quick"
 
 
 def test_lists_asked_for_without_end_do_not_read_the_disk_without_end(peer, monkeypatch):
