@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from sitl.modes import Mode
@@ -40,6 +40,8 @@ def test_no_parameter_stops_a_mode(flown: Any, mode: Mode, value: float) -> None
 
 
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@example(order=[(Mode.ALTCTL, 3.0)] * 8)
+@example(order=[(Mode.ALTCTL, 2.0), (Mode.ALTCTL, 3.0), (Mode.ALTCTL, 3.0)])
 @given(order=st.lists(st.tuples(st.sampled_from(MODES[2:]), st.floats(0.05, 3.0)), min_size=3, max_size=8))
 def test_modes_in_any_order_never_upset_it(flown: Any, order: list[tuple[Mode, float]]) -> None:
     flight = flown()
@@ -52,7 +54,7 @@ def test_modes_in_any_order_never_upset_it(flown: Any, order: list[tuple[Mode, f
         flight.run(seconds)
     assert flight.tilt_max_deg < 50.0
     flight.begin(Mode.LOITER)
-    flight.run(8.0)
+    flight.run(16.0)  # Altitude does not hold it against the air: it may come with more than 20 m/s
     assert math.hypot(*flight.velocity) < 0.5
 
 
