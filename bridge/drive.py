@@ -7,6 +7,7 @@ A client never sleeps and never looks at a clock. It asks its drive to `wait`, g
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 from bridge.clock import Clock, SimClock, WallClock
 from bridge.errors import PeerLost, PeerSilent
@@ -19,6 +20,8 @@ _JUMP_BACK_US = 1_000_000
 
 class Drive(ABC):
     """Vehicle time and the waiting for it."""
+
+    _look: Callable[[int], object] | None = None
 
     @abstractmethod
     def now_us(self) -> int:
@@ -47,6 +50,18 @@ class Drive(ABC):
         """Whether `now_us` means something yet."""
         return True
 
+    def running_us(self) -> int:
+        """Vehicle time, us, that also goes on while nothing is heard of the vehicle."""
+        return self.now_us()
+
+    def watch(self, look: Callable[[int], object] | None) -> None:
+        """Have vehicle time looked at as closely as it is known.
+
+        Args:
+            look: called with it (us) after every tick, or before every wait where ticks cannot be seen; None ends that.
+        """
+        self._look = look
+
     def sent_setpoint(self, quat: tuple[float, float, float, float]) -> None:
         """An attitude set-point was sent.
 
@@ -65,6 +80,17 @@ class SharedDrive(Drive):
 
     def __init__(self, clock: SimClock) -> None:
         self._clock = clock
+
+    def watch(self, look: Callable[[int], object] | None) -> None:
+        """Have vehicle time looked at after every tick; without anybody who looks it costs nothing."""
+        self._clock.forget(self._tell)
+        self._look = look
+        if look is not None:
+            self._clock.every_tick(self._tell)
+
+    def _tell(self) -> None:
+        if self._look is not None:
+            self._look(self._clock.now_us())
 
     def now_us(self) -> int:
         """Vehicle time, us."""
@@ -96,7 +122,7 @@ class NetworkDrive(Drive):
         self._clock: Clock = clock or WallClock()
         self._now_us = 0
         self._knows_time = False
-        self._looked_us = self._clock.now_us()
+        self._looked_us = self._heard_at_us = self._clock.now_us()
         self._waited_us = 0
         self._anything = False
 
@@ -109,6 +135,10 @@ class NetworkDrive(Drive):
         """Whether the vehicle has told its time."""
         return self._knows_time
 
+    def running_us(self) -> int:
+        """Latest vehicle time heard, and as much wall time as has passed since."""
+        return self._now_us + (self._clock.now_us() - self._heard_at_us if self._knows_time else 0)
+
     def heard(self, time_us: int) -> None:
         """A message carried this vehicle time; a jump back means that the vehicle started anew."""
         if time_us < self._now_us - _JUMP_BACK_US:
@@ -118,11 +148,14 @@ class NetworkDrive(Drive):
             )
         if time_us > self._now_us or not self._knows_time:
             self._now_us = max(self._now_us, time_us)
+            self._heard_at_us = self._clock.now_us()
             self._knows_time = True
             self._waited_us = 0
 
     def wait(self, link: Link, until_us: int) -> bytes | None:
         """Listen for up to 20 ms of wall time; vehicle time moves only with what comes."""
+        if self._look is not None:
+            self._look(self.running_us())
         data = link.recv(_SLICE_S)
         now = self._clock.now_us()
         # A pause of this whole computer is no silence of the vehicle: each look counts 0.1 s at most.

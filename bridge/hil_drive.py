@@ -113,6 +113,8 @@ class HilDrive(Drive):
         self._alone_since_us, self._left = None, False
         if self.each_tick is not None:
             self.each_tick()
+        if self._look is not None:
+            self._look(self.now_us())
 
     def _alone(self) -> None:
         now = self._clock.now_us()

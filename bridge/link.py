@@ -188,8 +188,8 @@ class LossyLink(Link):
         super().__init__(f"{link.name} (lossy)")
         self._link = link
         outward, inward = rng.spawn(2)
-        self._out = _Damage(outward, **shares)
-        self._in = _Damage(inward, **shares)
+        self._out = Damage(outward, **shares)
+        self._in = Damage(inward, **shares)
         self._arrived: deque[bytes] = deque()
 
     @property
@@ -217,8 +217,15 @@ class LossyLink(Link):
         self._link.close()
 
 
-class _Damage:
-    """What happens to datagrams in one direction."""
+class Damage:
+    """What happens to datagrams in one direction.
+
+    Args:
+        rng: the only source of chance. loss, duplicate, reorder, corrupt: shares, as for `LossyLink`.
+
+    Attributes:
+        count: datagrams that something happened to.
+    """
 
     def __init__(self, rng: Generator, *, loss: float, duplicate: float, reorder: float, corrupt: float) -> None:
         self._rng = rng
@@ -227,6 +234,7 @@ class _Damage:
         self.count = 0
 
     def passing(self, data: bytes) -> list[bytes]:
+        """What comes out of a datagram, and what had been held back."""
         # Four draws whatever happens, so that one share can be changed without reshuffling the others.
         lost, doubled, late, changed = self._rng.random(4) < (
             self._loss,
@@ -247,6 +255,7 @@ class _Damage:
         return passing if held is None else [*passing, held]
 
     def release(self) -> bytes | None:
+        """The datagram that is held back, if one is; it is not any more."""
         held, self._held = self._held, None
         return held
 

@@ -64,8 +64,7 @@ class Commander:
         self._landing = LandingWatch(parameters)
         self._tilt = TiltDetector(parameters)
         self._failsafe = Failsafe(parameters)
-        self._now_us = self._booted_us = 0
-        self._armed_us = 0
+        self._now_us = self._booted_us = self._armed_us = 0
         self._after_disarming = Mode.LOITER
         self._texts: list[Text] = []
         self._offboard_us: int | None = None
