@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.linalg
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sitl.actuators import allocate, motor_output
@@ -162,6 +162,7 @@ class TestAgainstMathematics:
 
 class TestWaysOfRunning:
     @settings(deadline=None, max_examples=15)
+    @example("sitl", "ant-x", {"k_phi": 0.0, "kp": 0.0, "ki": 32.0, "kd": 0.0}, 0.5, False)
     @given(
         st.sampled_from(["study", "sitl", "board"]),
         st.sampled_from(["ant-x", "ant-r", "carrier-1", "adam-0"]),
@@ -179,16 +180,25 @@ class TestWaysOfRunning:
     def test_arrays_and_lanes_give_the_same_flight(
         self, name: str, spec: str, gains: dict[str, float], fac: float, notched: bool
     ) -> None:
-        """Saturating, cycling, diverging: whatever the gains do."""
+        """Saturating, cycling, diverging: whatever the gains do.
+
+        An unstable loop makes something of rounding itself. How much it makes of little is seen in a neighbour, the
+        same flight with numbers larger by 1e-12 of themselves.
+        """
         extra = {"THR_MDL_FAC": fac if name != "study" else 0.0}
         if notched:
             extra |= {"IMU_GYRO_NF0_FRQ": 60.0, "IMU_GYRO_NF0_BW": 20.0}
         phi_sp = np.repeat(np.radians([20.0, -35.0, 0.0]), 60)
         what = job(spec, get_profile(name), gains, phi_sp, samples(spec, 5), **extra)
-        for one, other in zip(flown(what, True), flown(what, False), strict=True):
+        near = {key: getattr(what, key) * (1.0 + 1e-12) for key in ("derivatives", "hover_thrust", "phi_sp_rad")}
+        *lanes, lost = flown(what, True)
+        *arrays, lost_too = flown(what, False)
+        *neighbours, _ = flown(replace(what, **near), True)
+        assert np.array_equal(lost, lost_too)
+        for one, other, neighbour in zip(lanes, arrays, neighbours, strict=True):
             assert np.isfinite(one).all()
-            # in a limit cycle what rounding leaves grows with every swing
-            assert one == pytest.approx(other, rel=1e-6, abs=1e-6)
+            apart, grown = (np.abs(one - it).max(axis=1) for it in (other, neighbour))
+            assert (apart <= 1e-9 + 100.0 * np.maximum.accumulate(grown)).all()
 
     def test_a_sample_does_not_depend_on_its_neighbours(self) -> None:
         d = samples("ant-x", LANES + 3)
