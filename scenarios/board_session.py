@@ -54,13 +54,14 @@ class BoardSession:
         say: called with a line for people.
 
     Attributes:
-        link: the client's. drive: the client's time.
+        link: the client's. drive: the client's time. body: none in this process.
 
     Raises:
         UsageError, LinkError: the port cannot be opened, or the profile not be flown.
     """
 
     board = True
+    body: Body | None = None
 
     def __init__(
         self,

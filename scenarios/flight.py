@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from scenarios.gain_set import GainSet
+from scenarios.injected_fault import InjectedFault
 from scenarios.limits import Metric, Outcome
 from scenarios.scenario import Scenario
 from scenarios.telemetry import Telemetry
@@ -77,6 +78,7 @@ class FlightRecord:
         seed: of this flight's sensors and link.
         parameters: everything that was uploaded, the other axes' gains too.
         timing: how a real autopilot and our plant kept time, in a line; empty where none flew it.
+        faults: of the scenario, in its order: what became of each.
     """
 
     gain_set: GainSet
@@ -93,6 +95,7 @@ class FlightRecord:
     seed: int
     parameters: Mapping[str, float | int] = field(default_factory=dict)
     timing: str = ""
+    faults: tuple[InjectedFault, ...] = ()
 
     def metric(self, name: str, segment: str = "") -> Metric | None:
         """The flight's metric of that name, or one segment's; None if it was not asked for."""

@@ -119,6 +119,11 @@ class FlightFiles:
         if self.problem is None:
             self._attempt(lambda: self._recorder.event(t_s, severity, text))
 
+    def faults(self, t_s: float, text: str) -> None:
+        """Record which faults are in force from a vehicle time on; empty for none."""
+        if self.problem is None:
+            self._attempt(lambda: self._recorder.faults(t_s, text))
+
     def parameters(self, suffix: str, values: Mapping[str, float | int]) -> None:
         """Write parameters as QGroundControl does, before anything is changed.
 

@@ -39,7 +39,7 @@ class HilSession:
         say: called with a line for people.
 
     Attributes:
-        link: the client's. drive: the client's time. lockstep: how the two keep step.
+        body: the plant. link: the client's. drive: the client's time. lockstep: how the two keep step.
 
     Raises:
         UsageError: a simulator link that is no TCP.

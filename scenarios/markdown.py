@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from scenarios.flight import FlightRecord, RunRecord
+from scenarios.injected_fault import InjectedFault
 from scenarios.limits import METRICS, Metric, Outcome
 from scenarios.table import COLUMNS, UNSET, assumption_lines, blank_cells, cells, number, own_gains_line
 
@@ -100,11 +101,19 @@ def flight_page(flight: FlightRecord) -> str:
     if missing:
         parts += ["## Not measured", _bullets(missing)]
     parts += ["## Gains", gains_table([flight])]
+    if flight.faults:
+        parts += ["## Faults", _bullets(_when(fault) for fault in flight.faults)]
     if flight.warnings:
         parts += ["## Warnings", _bullets(flight.warnings)]
     if flight.timing:
         parts += ["## Timing", flight.timing]
     return "\n\n".join(parts) + "\n"
+
+
+def _when(fault: InjectedFault) -> str:
+    if fault.start_s is None:
+        return f"{fault.text}: never injected ({fault.plan})"
+    return f"{fault.text}: from {fault.start_s:.2f} s" + ("" if fault.end_s is None else f" to {fault.end_s:.2f} s")
 
 
 MARGINS = (

@@ -21,8 +21,10 @@ from bridge.link import Link, MemoryLink, open_link
 from bridge.vehicle_server import ServerLink, VehicleServer
 from scenarios import hil_flight, interrupts, sampler
 from scenarios.flight import Event, FlightRecord
+from scenarios.flight_faults import FlightFaults
 from scenarios.flight_files import FlightFiles
 from scenarios.flight_job import MEMORY, FlightJob
+from scenarios.injected_fault import judge_faults
 from scenarios.limits import Outcome, judge
 from scenarios.param_loan import ParamLoan, open_loan
 from scenarios.pilot import FlightLog, Pilot
@@ -137,6 +139,8 @@ class _Flight:
         self._loan: ParamLoan | None = None
         self._sampler: Sampler | None = None
         self._files: FlightFiles | None = None
+        self._vehicle: Vehicle | None = None
+        self._faults = FlightFaults(job, self._on_text)
 
     def run(self) -> None:
         """Everything that talks to the vehicle, with a teardown that always runs."""
@@ -155,6 +159,7 @@ class _Flight:
                 )
             )
             self._files.about = job.about()
+            self._faults.show = self._files.faults
         client = self._open_client()
         _spare_the_collector()
         client.on_text = self._on_text
@@ -174,10 +179,23 @@ class _Flight:
         self._log = pilot.log
         try:
             self._upload(client)
+            self._prepare_faults(client, pilot)
             pilot.fly()
         finally:
             with interrupts.landing():
                 self._tear_down(client, pilot)
+
+    def _prepare_faults(self, client: Client, pilot: Pilot) -> None:
+        assert self._loan is not None
+        body: Any = self._vehicle if self._session is None else self._session.body
+        self._faults.begin(
+            client,
+            pilot,
+            self._loan,
+            body=None if body is None else lambda: body.faults,
+            autopilot=None if self._vehicle is None else self._vehicle.autopilot,
+        )
+        self._stack.callback(self._faults.end)
 
     def _tear_down(self, client: Client, pilot: Pilot) -> None:
         """Land, restore, leave the streams as they were: each is tried even if the one before failed."""
@@ -208,7 +226,7 @@ class _Flight:
         if session is not None:
             link, drive = session.link, session.drive
         elif job.in_memory:
-            vehicle = Vehicle(job.model, job.profile, seed=job.scenario.seed)
+            vehicle = self._vehicle = Vehicle(job.model, job.profile, seed=job.scenario.seed)
             clock = SimClock(vehicle.tick_us)
             link, far = MemoryLink.pair()
             server = VehicleServer(vehicle, [ServerLink(far, Connection(1, 1, datagram=True), 0, "memory")])
@@ -219,7 +237,7 @@ class _Flight:
         if session is None:
             self._stack.callback(link.close)
         files = self._files
-        client = Client(link, drive, log=files.frame if files else None)
+        client = Client(self._faults.on_link(link, drive), drive, log=files.frame if files else None)
         if files is not None:
             from scenarios.recorder.link_lines import LinkCounts
 
@@ -265,7 +283,7 @@ class _Flight:
         assert self._loan is not None
         self._progress("upload")
         parameters = self._job.parameters
-        self._loan.back_up(parameters)
+        self._loan.back_up({**self._faults.parameters, **parameters})
         if self._files is not None:
             self._files.parameters(_BACKUP, {name: value.value for name, value in self._loan.was.items()})
             self._files.parameters(".params", {name: value for name, (value, _) in parameters.items()})
@@ -325,11 +343,14 @@ class _Flight:
         segments = tuple(log.segments)
         telemetry = self._sampler.telemetry(segments) if self._sampler else Telemetry.empty()
         margins = flown_margins(job)
-        metrics = flight_metrics(telemetry, segments, margins)
+        faults = self._faults.injected
+        metrics = flight_metrics(telemetry, segments, margins, faults)
         failure = failure or diverged(telemetry)
         outcome, reason, metrics = judge(metrics, job.scenario.limits, failure)
         if stopped is not None and not log.failure:
             outcome = Outcome.UNSET
+        else:
+            outcome, reason = judge_faults(outcome, reason, faults)
         notes = [*self._notes, *log.notes]
         timing = ""
         if self._session is not None:
@@ -351,6 +372,7 @@ class _Flight:
             seed=job.scenario.seed,
             parameters={name: value for name, (value, _) in job.parameters.items()},
             timing=timing,
+            faults=faults,
         )
         with self._stack:
             if self._files is not None:

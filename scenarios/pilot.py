@@ -78,6 +78,10 @@ class Pilot:
         self._sampled = sampled
         self.watch: Callable[[], object] = lambda: None
         """Called fifty times a second from take-off on; what it raises ends the flight."""
+        self.began: Callable[[str], object] = lambda _: None
+        """Called with a manoeuvre's name at its first set-point, and with "" when the take-off is under way."""
+        self.over: Callable[[], object] = lambda: None
+        """Called when the last manoeuvre is over, or the flight has ended before."""
         self._client = client
         self._scenario = scenario
         self._say = say
@@ -111,6 +115,7 @@ class Pilot:
         finally:
             self._client.background = None
             self._watching = False
+            self.over()
 
     def come_down(self, *, may_force: bool) -> None:
         """Land and disarm, whatever happened before.
@@ -149,6 +154,7 @@ class Pilot:
         client.arm()
         client.takeoff(height)
         self._watching = True
+        self.began("")
 
         def there() -> bool:
             self._check(least_height_m=-math.inf)
@@ -239,6 +245,7 @@ class Pilot:
         self._signal_start_us = start_us
         self._next_us = start_us
         start_s = start_us * 1e-6
+        self.began(manoeuvre.name)
         self._say(6, f"{manoeuvre.name} begins")
         end_us = start_us + round(manoeuvre.duration_s * 1e6)
         ended = ""

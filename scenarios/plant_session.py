@@ -7,6 +7,7 @@ from typing import Protocol
 from bridge.drive import Drive
 from bridge.link import Link
 from scenarios.sampler import Truth
+from sitl.body import Body
 
 
 class PlantSession(Protocol):
@@ -17,6 +18,11 @@ class PlantSession(Protocol):
     """
 
     board: bool
+
+    @property
+    def body(self) -> Body | None:
+        """Plant and sensors, where they are in this process."""
+        ...
 
     @property
     def link(self) -> Link:

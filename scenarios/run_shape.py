@@ -84,6 +84,7 @@ SEGMENT = {
     "amplitude_rad": REAL,
     "phi_from_rad": REAL,
 }
+FAULT = {"kind": TEXT, "settings": Each(ANY)}
 FLIGHT = {
     "gain_set": {"name": TEXT, "source": TEXT, "note": TEXT, "file": Maybe(TEXT), "parameters": NUMBERS},
     "vehicle": TEXT,
@@ -95,6 +96,17 @@ FLIGHT = {
     "metrics": Each(METRIC, many=True),
     "margins": Each(ANY),
     "segments": Each(SEGMENT, many=True),
+    "faults": Each(
+        {
+            **FAULT,
+            "text": TEXT,
+            "plan": TEXT,
+            "start_s": NUMBER,
+            "end_s": NUMBER,
+            "datagrams": Maybe(Each(COUNT, many=True)),
+        },
+        many=True,
+    ),
     "events": Each({"t_s": REAL, "severity": COUNT, "text": TEXT}, many=True),
     "rows": COUNT,
     "telemetry_sha256": TEXT,
@@ -143,6 +155,7 @@ SCENARIO = {
     "limits_name": TEXT,
     "limits": Each({"metric": TEXT, "minimum": NUMBER, "maximum": NUMBER}, many=True),
     "gate": Each(ANY),
+    "faults": Each({**FAULT, "at_s": REAL, "manoeuvre": TEXT, "duration_s": NUMBER}, many=True),
 }
 VEHICLE = {
     "spec": TEXT,
@@ -179,7 +192,7 @@ RUN = {
     "baseline": Maybe(FLIGHT),
     "twins": Each(TWIN, many=True),
 }
-CAME_LATER = frozenset({"twins"})
+CAME_LATER = frozenset({"twins", "faults"})
 """Keys that the present schema version got after others had written it already: not there is no damage."""
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from scenarios.faults import Fault, parse_faults
 from scenarios.limits import LIMIT_SETS, Limit, parse_limits
 from scenarios.manoeuvres import Manoeuvre, parse_manoeuvres
 from scenarios.toml_file import read_toml
@@ -73,6 +74,7 @@ class Scenario:
         limits: on the flight's metrics.
         limits_name: name of the limit set; "custom" for the file's own.
         gate: before each manoeuvre.
+        faults: that every flight meets, in the order written.
         path: the file.
     """
 
@@ -92,6 +94,7 @@ class Scenario:
     limits: tuple[Limit, ...]
     limits_name: str = "custom"
     gate: Gate = field(default_factory=Gate)
+    faults: tuple[Fault, ...] = ()
     path: Path | None = None
 
     def resolve_profile(self) -> Profile:
@@ -162,6 +165,7 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
         limits=limits,
         limits_name=limits_name,
         gate=_gate(file),
+        faults=parse_faults(data["fault"] if "fault" in file else None, path, manoeuvres),
         path=path,
     )
     file.finish()

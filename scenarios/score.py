@@ -13,7 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from scenarios.fault_metrics import fault_metrics, no_segment
 from scenarios.flight import Segment
+from scenarios.injected_fault import InjectedFault
 from scenarios.limits import METRICS, Metric, Outcome, measured
 from scenarios.metrics import (
     FloatArray,
@@ -40,7 +42,10 @@ WORST: Mapping[str, Callable[[Metric], float]] = {
 
 
 def flight_metrics(
-    telemetry: Telemetry, segments: Sequence[Segment], margins: Mapping[str, Any] | None = None
+    telemetry: Telemetry,
+    segments: Sequence[Segment],
+    margins: Mapping[str, Any] | None = None,
+    faults: Sequence[InjectedFault] = (),
 ) -> tuple[Metric, ...]:
     """Everything measured on a flight: the flight's own metrics first, then those of each segment.
 
@@ -48,6 +53,7 @@ def flight_metrics(
         telemetry: of the flight.
         segments: of the flight; one that the telemetry does not cover gives UNSET metrics.
         margins: of the loop that was flown, fields of `sitl.stability.Margins`; None if not computed.
+        faults: that were planned for the flight, and what became of them.
     """
     shakes = {s.name: _oscillation(telemetry, s) for s in segments if s.kind in ("step", "hold")}
     cycles = [shake for shake in shakes.values() if shake.is_limit_cycle]
@@ -55,11 +61,14 @@ def flight_metrics(
     of_segments: list[Metric] = []
     for segment in segments:
         of_segments += _segment_metrics(telemetry, segment, cycle)
+    of_faults = fault_metrics(telemetry, segments, faults)
+    of_segments += of_faults
     whole = [_worst(name, of_segments) for name in dict.fromkeys(m.name for m in of_segments)]
     whole += _shake_metrics(list(shakes.values()), "") if shakes else []
     for name, shake in shakes.items():
         of_segments += _shake_metrics([shake], name)
     whole += margin_metrics(margins) if margins else []
+    whole += no_segment(faults) if faults and not of_faults else []
     whole += _estimate_metrics(telemetry, segments)
     whole += _data_metrics(telemetry, segments)
     order = {name: place for place, name in enumerate(METRICS)}

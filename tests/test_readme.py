@@ -19,6 +19,8 @@ import numpy as np
 import pytest
 
 from scenarios import cli
+from scenarios.fault_kinds import KINDS as FAULT_KINDS
+from scenarios.faults import parse_faults
 from scenarios.flight import FlightRecord
 from scenarios.limits import LIMIT_CYCLE_RAD_S, METRICS
 from scenarios.manoeuvres import KINDS, make_manoeuvre
@@ -163,6 +165,38 @@ def test_scenarios_and_manoeuvres_are_all_named_with_their_keys() -> None:
         assert set(re.findall(r"[a-z][a-z0-9_]+_(?:deg|s|hz|rad)\b|sweep|rate_deg_s", keys)) == set(settings) - {"kind"}
         for key, default in re.findall(r"(\w+_s) (\d[\d.]*)", keys):
             assert settings[key] == float(default), (kind, key)
+
+
+FAULTS: dict[str, dict[str, Any]] = {
+    "gust": {"wind_m_s": 1.0},
+    "motor_efficiency": {"motor": 1, "efficiency_pct": 50.0},
+    "motor_out": {"motor": 1},
+    "motor_saturation": {"motor": 1, "most_pct": 50.0},
+    "battery_sag": {"sag_pct": 10.0},
+    "gyro_noise": {"noise_deg_s": 1.0},
+    "gyro_bias": {"bias_deg_s": 1.0},
+    "gyro_dropout": {"loss_pct": 10.0},
+    "gyro_stuck": {},
+    "loop_delay": {"delay_ticks": 1},
+    "link_loss": {"loss_pct": 10.0},
+    "link_delay": {"delay_s": 0.1},
+    "link_jitter": {"jitter_s": 0.1},
+    "link_duplication": {"share_pct": 10.0},
+    "link_reordering": {"share_pct": 10.0},
+    "link_corruption": {"share_pct": 10.0},
+    "parameter": {"parameter": "MC_ROLL_P", "value": 5.0},
+    "autopilot_restart": {},
+}
+
+
+def test_faults_are_all_named_with_their_keys() -> None:
+    rows = {kind: keys for kind, keys, _ in table("fault", "keys")}
+    assert list(rows) == list(FAULT_KINDS) == list(FAULTS)
+    for kind, keys in rows.items():
+        (fault,) = parse_faults([{"kind": kind, "at_s": 1.0, **FAULTS[kind]}], Path("fault.toml"), ())
+        assert re.findall(r"(?<!\")\b[a-z_0-9]+\b(?!\")", re.sub(r" [\d.]+", "", keys)) == list(fault.settings), kind
+        for key, default in re.findall(r'(\w+) "?(\w+)"?', keys):
+            assert format(fault.settings[key], "g" if default.isdigit() else "") == default, (kind, key)
 
 
 # -- what is promised ------------------------------------------------------------------------------------------------

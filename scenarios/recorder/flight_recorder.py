@@ -102,6 +102,10 @@ class FlightRecorder:
         self._tell("segment", segment)
         self._drawing.segment(segment)
 
+    def faults(self, t_s: float, text: str) -> None:
+        """Mark which faults are in force from a vehicle time on; empty for none."""
+        self.recording.lane("/state/fault", t_s, text)
+
     def link(self, t_s: float, counts: LinkCounts) -> None:
         """What the link's counters say at a vehicle time, s."""
         self._tell("link", t_s, counts)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -45,6 +46,7 @@ def step_overlay(sets: Sequence[Drawn], figure: str) -> Drawing:
     first = sets[0].trace
     panel = _step_panel(first.amplitude_deg, max(one.trace.duration_s for one in sets), 6.2, 3.4)
     with panel.drawn() as (axes,):
+        _shade_faults(axes, first.faults)
         for one in sorted(sets, key=lambda drawn: drawn.passed):
             axes.plot(
                 *_thinned(one.trace.t_s, one.trace.roll_deg), **line(one.style, **emphasis(one.passed, len(sets)))
@@ -54,7 +56,7 @@ def step_overlay(sets: Sequence[Drawn], figure: str) -> Drawing:
     return Drawing(
         svg,
         f"Roll angle over time after a step of {first.amplitude_deg:g} degrees, with the set-point and a band of 5 % "
-        f"around it. Gain sets: {names}.",
+        f"around it. Gain sets: {names}.{_told(first.faults)}",
     )
 
 
@@ -69,6 +71,7 @@ def step_figure(trace: StepTrace, style: Style, name: str, figure: str, own: Ste
     size = trace.amplitude_deg
     notes = []
     with panel.drawn() as (axes,):
+        _shade_faults(axes, trace.faults)
         if own is not None:
             axes.plot(*_thinned(own.t_s, own.roll_deg), color=INK["ink"], linewidth=0.9, linestyle=(0, (4, 2)))
         axes.plot(*_thinned(trace.t_s, trace.roll_deg), **line(style, 1.7))
@@ -107,7 +110,7 @@ def step_figure(trace: StepTrace, style: Style, name: str, figure: str, own: Ste
         f"{TITLES[metric]} " + (f"{value:.3g}" if value is not None else f"not measured: {trace.reasons[metric]}")
         for metric, value in trace.metrics.items()
     ]
-    return Drawing(svg, f"Step response of {name}: {'; '.join(values) or 'nothing was measured'}.")
+    return Drawing(svg, f"Step response of {name}: {'; '.join(values) or 'nothing was measured'}.{_told(trace.faults)}")
 
 
 def _wrapped(text: str) -> list[str]:
@@ -125,11 +128,13 @@ def track_figure(trace: TrackTrace, style: Style, name: str, figure: str, most_d
     """
     panel = _track_panel(trace.duration_s, most_deg)
     with panel.drawn() as (axes,):
+        _shade_faults(axes, trace.faults)
         axes.plot(*_thinned(trace.t_s, trace.setpoint_deg), color=INK["target"], linewidth=2.6, alpha=0.55)
         axes.plot(*_thinned(trace.t_s, trace.roll_deg), color=INK[style.hue], linewidth=1.1)
         svg = panel.svg(figure)
     parts = [f"{TITLES[key]} {value:.3g}" for key, value in trace.metrics.items() if value is not None]
-    return Drawing(svg, f"Roll set-point and roll angle of {name} over {trace.duration_s:g} s: {', '.join(parts)}.")
+    over = f"Roll set-point and roll angle of {name} over {trace.duration_s:g} s: {', '.join(parts)}."
+    return Drawing(svg, over + _told(trace.faults))
 
 
 @lru_cache(maxsize=8)
@@ -156,6 +161,17 @@ def _track_panel(duration_s: float, most_deg: float) -> Panel:
         axes.set_ylabel("roll [deg]")
         panel.settle()
     return panel
+
+
+def _shade_faults(axes: Any, faults: Sequence[tuple[float, float]]) -> None:
+    for begin_s, end_s in faults:
+        axes.axvspan(begin_s, end_s, color=INK["bad"], alpha=0.12, linewidth=0)
+
+
+def _told(faults: Sequence[tuple[float, float]]) -> str:
+    """Shaded spans for who cannot see them."""
+    spans = ", ".join(f"{begin_s:.1f} to {end_s:.1f} s" for begin_s, end_s in faults)
+    return f" Faults in force, shaded: {spans}." if spans else ""
 
 
 def _thinned(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,7 @@ from typing import Any
 from scenarios.report.computed import Computed, Done, compute, key_of
 from scenarios.report.computed_sections import delay_section, loop_section, samples_section, sensitivity_section
 from scenarios.report.elements import UNSET, Cell, Line, Section, Sets, Table
+from scenarios.report.fault_section import faults_section
 from scenarios.report.flown_model import flown_model
 from scenarios.report.flown_sections import (
     numbers_section,
@@ -40,6 +41,7 @@ def report_page(run: StoredRun, done: Done | None = None, *, threads: int | None
     sections = [
         numbers_section(sets),
         warnings_section(sets),
+        faults_section(sets),
         *step_sections(sets, telemetry),
         *track_sections(sets, telemetry),
         *_loops(sets, found),

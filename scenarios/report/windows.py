@@ -32,6 +32,7 @@ class StepTrace:
         metrics: name -> value in run.json; None where it was not measured. reasons: why not.
         from_s: when the rise begins, the first crossing of 10 %; None without a rise.
         peak: time and angle of the largest excess; None without an overshoot.
+        faults: from when to when one was in force, s from the step.
     """
 
     segment: str
@@ -44,6 +45,7 @@ class StepTrace:
     reasons: Mapping[str, str] = field(default_factory=dict)
     from_s: float | None = None
     peak: tuple[float, float] | None = None
+    faults: Sequence[tuple[float, float]] = ()
 
     @property
     def rise(self) -> tuple[float, float] | None:
@@ -58,7 +60,7 @@ class TrackTrace:
 
     Attributes:
         segment: its name. t_s: (n,) from its start. roll_deg, setpoint_deg: (n,). duration_s: of it.
-        metrics: name -> value in run.json. reasons: why not.
+        metrics: name -> value in run.json. reasons: why not. faults: as for a step.
     """
 
     segment: str
@@ -68,6 +70,7 @@ class TrackTrace:
     duration_s: float
     metrics: Mapping[str, float | None] = field(default_factory=dict)
     reasons: Mapping[str, str] = field(default_factory=dict)
+    faults: Sequence[tuple[float, float]] = ()
 
 
 def segments_of(flights: Iterable[Mapping[str, Any]], kind: str) -> list[str]:
@@ -112,7 +115,8 @@ def step_trace(flight: Mapping[str, Any], telemetry: Telemetry, name: str) -> St
     if metrics.get("overshoot_pct") and len(done):
         k = int(np.argmax(done))
         peak = float(t_after[k]), float(done[k] * size)
-    return StepTrace(name, t, roll, setpoint, size, end_s - start_s, metrics, reasons, from_s, peak)
+    faults = _faults(flight, segment)
+    return StepTrace(name, t, roll, setpoint, size, end_s - start_s, metrics, reasons, from_s, peak, faults)
 
 
 def track_trace(flight: Mapping[str, Any], telemetry: Telemetry, name: str) -> TrackTrace | None:
@@ -126,7 +130,19 @@ def track_trace(flight: Mapping[str, Any], telemetry: Telemetry, name: str) -> T
     roll, setpoint = (np.degrees(rows[column].astype(np.float64)) for column in ("phi_rad", "phi_sp_rad"))
     metrics, reasons = _metrics(flight, name, ("vaf_pct", "lag_s", "vaf_lag_removed_pct", "rms_error_deg"))
     length_s = segment["end_s"] - segment["start_s"]
-    return TrackTrace(name, rows["t_s"] - segment["start_s"], roll, setpoint, length_s, metrics, reasons)
+    t, faults = rows["t_s"] - segment["start_s"], _faults(flight, segment)
+    return TrackTrace(name, t, roll, setpoint, length_s, metrics, reasons, faults)
+
+
+def _faults(flight: Mapping[str, Any], segment: Mapping[str, Any]) -> list[tuple[float, float]]:
+    """From when to when faults were in force within a segment, s from its start."""
+    start_s, end_s = segment["start_s"], segment["end_s"]
+    spans = []
+    for fault in flight["faults"]:
+        if fault["start_s"] is not None:
+            until_s = end_s if fault["end_s"] is None else fault["end_s"]
+            spans.append((max(fault["start_s"], start_s) - start_s, min(until_s, end_s) - start_s))
+    return [(begin, end) for begin, end in spans if end > begin]
 
 
 def _segment(flight: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
