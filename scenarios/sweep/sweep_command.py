@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from scenarios.sweep.dataset import Dataset
@@ -145,8 +144,11 @@ def _work(plan: Plan, dataset: Dataset, args: argparse.Namespace, tell: Tell) ->
 
 
 def _show(path: Path, args: argparse.Namespace, tell: Tell) -> int:
-    from scenarios.sweep.dataset import Dataset
+    """The result on standard output, its files in the sweep's folder."""
+    from scenarios.sweep.shown_sweep import show_sweep
+    from scenarios.table import terminal_width
 
-    found: dict[str, Any] = Dataset(path).facts()
-    sys.stdout.write(json.dumps({"folder": str(path), "points": found["points"]}) + "\n")
-    return EXIT_OK
+    width, colour = terminal_width(sys.stdout)
+    passing, text = show_sweep(path, as_json=args.json, width=width, colour=colour, tell=tell)
+    sys.stdout.write(text)
+    return EXIT_GATE if args.gate and not passing else EXIT_OK
