@@ -130,12 +130,16 @@ class RunResult:
 
 
 def run_scenario(
-    scenario: Scenario, options: RunOptions, progress: Callable[[Progress], object] = lambda _: None
+    scenario: Scenario,
+    options: RunOptions,
+    progress: Callable[[Progress], object] = lambda _: None,
+    gain_sets: Sequence[GainSet] = (),
 ) -> RunResult:
     """Fly every gain set of a scenario.
 
     Args:
         scenario: with its gain sets. options: how. progress: called at every phase of every flight.
+        gain_sets: flown instead of those that the scenario refers to, if there are any.
 
     Returns:
         the run; flights that were flown are in it even if something stopped it.
@@ -144,15 +148,18 @@ def run_scenario(
         UsageError, FileError: before anything is flown: a bad file, name or number.
     """
     with ExitStack() as stack:
-        return _run_scenario(scenario, options, progress, stack)
+        return _run_scenario(scenario, options, progress, gain_sets or load_all(scenario.gain_sets), stack)
 
 
 def _run_scenario(
-    scenario: Scenario, options: RunOptions, progress: Callable[[Progress], object], stack: ExitStack
+    scenario: Scenario,
+    options: RunOptions,
+    progress: Callable[[Progress], object],
+    gain_sets: Sequence[GainSet],
+    stack: ExitStack,
 ) -> RunResult:
     model = scenario.resolve_vehicle()
     profile = scenario.resolve_profile()
-    gain_sets = load_all(scenario.gain_sets)
     if not gain_sets:
         raise UsageError('no gain sets to fly: give --gains, for example "--gains table_7_2"')
     candidates = [plan(gain_set, scenario, model, profile) for gain_set in gain_sets]

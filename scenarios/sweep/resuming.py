@@ -13,11 +13,12 @@ from scenarios.sweep.sweep_file import load_sweep
 from sitl.errors import FileError, UsageError
 
 
-def plan_of(dataset: Dataset, path: Path | None = None) -> Plan:
+def plan_of(dataset: Dataset, path: Path | None = None, *, same_program: bool = True) -> Plan:
     """The plan of a dataset.
 
     Args:
         dataset: begun before. path: of the sweep file; where it was read from without.
+        same_program: rows are to be added: only by the program that began it.
 
     Raises:
         FileError: the dataset is of another schema or another sweep, or the file has gone; names what differs.
@@ -35,7 +36,7 @@ def plan_of(dataset: Dataset, path: Path | None = None) -> Plan:
             f"was begun with another sweep than {source} is now: {difference(facts['plan'], mine)}",
             "Put that back, or start a new sweep without --resume",
         )
-    here = program_facts()
+    here = program_facts() if same_program else {}
     for name in here:
         if facts.get(name) != here[name]:
             differing = difference({name: facts.get(name)}, {name: here[name]})

@@ -61,21 +61,24 @@ def run(args: argparse.Namespace, *, tell: Tell) -> int:
     if args.show is not None:
         if args.sweep is not None and args.show == NEWEST and Path(args.sweep).is_dir():
             args.show, args.sweep = args.sweep, None
+        _check_fly(args)
         if args.sweep is not None or args.resume is not None:
             raise UsageError("--show looks at what is there: leave out SWEEP.toml and --resume")
-        return _show(_folder(args.show, Path(args.out), ""), args, tell)
+        path = _folder(args.show, Path(args.out), "")
+        if args.fly:
+            _fly(path, args, tell)
+        return _show(path, args, tell)
     if args.sweep is None and args.resume is None:
         raise UsageError("give a SWEEP.toml, --resume to go on with a sweep, or --show to look at one")
     if args.jobs < 0:
         raise UsageError(f"--jobs {args.jobs}: give 1 or more")
-    if args.fly < 0:
-        raise UsageError(f"--fly {args.fly}: give 0 or more")
-    if args.px4 is not None and not args.fly:
-        raise UsageError("--px4 flies the best: say how many with --fly K")
+    _check_fly(args)
     plan, dataset = _begin(args, tell)
     for warning in plan.warnings:
         tell(warning)
     _work(plan, dataset, args, tell)
+    if args.fly:
+        _fly(dataset.path, args, tell)
     return _show(dataset.path, args, tell)
 
 
@@ -141,6 +144,36 @@ def _work(plan: Plan, dataset: Dataset, args: argparse.Namespace, tell: Tell) ->
         except KeyboardInterrupt:
             tell(f"stopped; what is done is kept. Go on with: froude sweep --resume {dataset.path}")
             raise
+
+
+def _check_fly(args: argparse.Namespace) -> None:
+    from scenarios.px4_process import Px4Process
+    from sitl.errors import UsageError
+
+    if args.fly < 0:
+        raise UsageError(f"--fly {args.fly}: give 0 or more")
+    if args.px4 is not None:
+        if not args.fly:
+            raise UsageError("--px4 flies the best: say how many with --fly K")
+        Px4Process(Path(args.px4), Path(), 0)  # better now than after hours of sweeping
+
+
+def _fly(path: Path, args: argparse.Namespace, tell: Tell) -> None:
+    """Fly the best, and write down where batch and flights differ; what was flown before an interrupt stays."""
+    from scenarios import interrupts
+    from scenarios.sweep.flying import fly_best
+
+    with interrupts.caught():
+        text = fly_best(
+            path,
+            args.fly,
+            px4=None if args.px4 is None else Path(args.px4),
+            jobs=args.jobs,
+            command=("froude", *args.argv),
+            tell=tell,
+        )
+    if not args.json:
+        sys.stdout.write(text)
 
 
 def _show(path: Path, args: argparse.Namespace, tell: Tell) -> int:
