@@ -11,20 +11,17 @@ from __future__ import annotations
 
 import atexit
 import os
-import pickle
 import socket
-import struct
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 from typing import Any, Final
 
+from scenarios.recorder.live_message import BadMessage, encode
 from sitl.errors import UsageError
 
 HOST: Final = "127.0.0.1"
-LENGTH: Final = struct.Struct("<I")
-"""Before each message: how long it is."""
 
 _feeds: dict[int, LiveFeed] = {}
 
@@ -67,18 +64,18 @@ class LiveFeed:
         """Tell of something; returns at once, whatever has become of the view.
 
         Args:
-            what: a method of `live_viewer.LiveView`. about: its arguments, plain data.
+            what: one of `live_message.WORDS`. about: its facts.
         """
         if self._lost:
             return
-        message = pickle.dumps((what, *about), protocol=pickle.HIGHEST_PROTOCOL)
         try:
+            message = encode(what, *about)
             # nobody reads it any more: do not fill the disk
             self._lost = self.process.poll() is not None
             if not self._lost:
-                self._spool.write(LENGTH.pack(len(message)) + message)
-        except OSError:
-            self._lost = True  # a full disk ends the view, not the flight
+                self._spool.write(message)
+        except (OSError, BadMessage):
+            self._lost = True  # a full disk ends the view, not the flight; so does what is too large to be shown
 
     def close(self) -> None:
         """Nothing more will be told."""

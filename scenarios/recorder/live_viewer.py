@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import pickle
 import subprocess
 import sys
 import threading
@@ -19,13 +18,15 @@ from typing import IO, Any
 
 from scenarios.recorder.flight_drawing import FlightDrawing, FlownVehicle
 from scenarios.recorder.flight_plots import Columns
-from scenarios.recorder.live import HOST, LENGTH, address
+from scenarios.recorder.live import HOST, address
+from scenarios.recorder.live_message import WORDS, BadMessage, decode, size_of
 from scenarios.recorder.stream import Recording
 
 MEMORY = "256MB"
 """What is kept for a viewer that joins late; the oldest is dropped first."""
 
 POLL_S = 0.05
+READ_BYTES = 4 << 20
 LINGER_S = 3.0
 """How long viewers are given to fetch the end."""
 
@@ -67,15 +68,15 @@ class LiveView:
                 self._drawing.recording.stream.flush(timeout_sec=LINGER_S)
 
     def take(self, what: str, *about: Any) -> None:
-        """Draw one message of the flight."""
+        """Draw one message of the flight; what is none of `live_message.WORDS` is left alone."""
         if what in ("begin", "rows"):
             getattr(self, what)(*about)
-        elif self._drawing is not None:
+        elif what in WORDS and self._drawing is not None:
             getattr(self._drawing, what)(*about)
 
 
 def messages(spool: IO[bytes], flying: int) -> Iterator[tuple[Any, ...]]:
-    """What is told, until the process that tells has ended and all is read.
+    """What is told, until the process that tells has ended and all is read, or until it makes no sense.
 
     Args:
         spool: being written. flying: that process.
@@ -84,15 +85,15 @@ def messages(spool: IO[bytes], flying: int) -> Iterator[tuple[Any, ...]]:
     waiting = b""
     while True:
         ended = os.getppid() != flying
-        data = spool.read()
+        data = spool.read(READ_BYTES)
         waiting += data
         start = 0
-        while len(waiting) >= start + LENGTH.size:
-            end = start + LENGTH.size + LENGTH.unpack_from(waiting, start)[0]
-            if len(waiting) < end:
-                break
-            yield pickle.loads(waiting[start + LENGTH.size : end])
-            start = end
+        try:
+            while (size := size_of(waiting, start)) is not None and len(waiting) >= start + size:
+                yield decode(waiting[start : start + size])
+                start += size
+        except BadMessage:
+            return  # where the next one would begin is not known either
         waiting = waiting[start:]
         if not data:
             if ended:

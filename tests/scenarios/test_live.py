@@ -3,18 +3,27 @@
 import contextlib
 import ctypes.util
 import os
+import pickle
 import signal
 import socket
 import subprocess
 import sys
 import threading
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from scenarios.flight import Segment
 from scenarios.one_flight import fly
-from scenarios.recorder import live
+from scenarios.recorder import live, live_message
+from scenarios.recorder.flight_drawing import FlownVehicle
+from scenarios.recorder.link_lines import LinkCounts
 from scenarios.recorder.live_viewer import messages
 from scenarios.recorder.viewer import free_port, started
+from sitl.airframe import Rotor
+from sitl.control_loop import CONTROL_SETTINGS
 from sitl.errors import UsageError
 
 
@@ -109,16 +118,84 @@ def test_a_taken_port_is_named():
             live.feed(taken)
 
 
-def test_messages_come_whole_and_end_with_the_flight(tmp_path):
-    import pickle
+def said_by_a_flight():
+    rows = {
+        "t_s": np.arange(3.0),
+        "phi_rad": np.array([0.1, np.nan, -np.inf], np.float32),
+        "nav_state": np.arange(3, dtype=np.int16),
+        "armed": np.array([True, False, True]),
+    }
+    vehicle = FlownVehicle((Rotor(0.1, 0.2, 0.0, -0.05),), (0.3, 0.2, 0.1), np.ones(1, CONTROL_SETTINGS))
+    return [
+        ("begin", "froude", "run-set", "a <set>", vehicle),
+        ("rows", rows),
+        ("event", 1.25, 6, "text \u00e9 \ud800 " * 5000),
+        ("segment", Segment("step", "step", "step", 1.0, 2.0, 0.17, 0.0)),
+        ("link", 0.1, LinkCounts(1, 2, 3, 4, 5)),
+        ("end", "# summary", "", {"run": {"seed": 1, "share": 0.5, "vehicle": "ANT-X", "none": None}}),
+    ]
 
-    said = [("event", 1.0, 6, "x" * n) for n in (1, 1000, 100_000)]
+
+def read_back(tmp_path, data):
     spool = tmp_path / "spool"
-    spool.write_bytes(
-        b"".join(live.LENGTH.pack(len(data)) + data for data in (pickle.dumps(one) for one in said)) + b"\x09"
-    )
+    spool.write_bytes(data)
     with spool.open("rb") as file:
-        assert list(messages(file, flying=-1)) == said
+        return list(messages(file, flying=-1))
+
+
+def test_messages_come_whole_and_end_with_the_flight(tmp_path):
+    said = said_by_a_flight()
+    assert {what for what, *_ in said} == set(live_message.WORDS)
+    heard = read_back(tmp_path, b"".join(live_message.encode(*one) for one in said) + b"\x09")
+    (_, *begun), (_, batch), *rest = heard
+    assert begun[:3] == list(said[0][1:4])
+    assert (list(begun[3].rotors), begun[3].frame_m) == (list(said[0][4].rotors), said[0][4].frame_m)
+    assert begun[3].settings == said[0][4].settings
+    for name, values in said[1][1].items():
+        assert batch[name].dtype == values.dtype
+        assert batch[name].tobytes() == values.tobytes()
+    assert rest == said[2:]
+
+
+def test_numbers_of_numpy_are_told_as_numbers():
+    told = live_message.decode(live_message.encode("end", "", "", {"run": {"a": np.int64(3), "b": np.float32(0.5)}}))
+    assert told == ("end", "", "", {"run": {"a": 3, "b": 0.5}})
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        live_message.LENGTHS.pack(1 << 31, 0),
+        live_message.LENGTHS.pack(2, 1 << 31) + b"[]",
+        live_message.LENGTHS.pack(2, 0) + b"[]",
+        live_message.LENGTHS.pack(4, 0) + b"null",
+        live_message.LENGTHS.pack(12, 0) + b'["__init__"]',
+        live_message.LENGTHS.pack(50_000, 0) + b"[" * 50_000,
+        live_message.LENGTHS.pack(36, 8) + b'["rows",[["t_s","|O",1]]]'.ljust(36) + bytes(8),
+        live_message.LENGTHS.pack(36, 8) + b'["rows",[["t_s","<f8",-1]]]'.ljust(36) + bytes(8),
+        live_message.LENGTHS.pack(36, 8) + b'["rows",[["t_s","<f8",99999]]]'.ljust(36) + bytes(8),
+        live_message.LENGTHS.pack(36, 8) + b'["rows",[["t_s","<f4",1]]]'.ljust(36) + bytes(8),
+        live_message.LENGTHS.pack(36, 8) + b'["rows",[["t_s",["<f4"],1]]]'.ljust(36) + bytes(8),
+        live_message.LENGTHS.pack(40, 0) + b'["segment",{"name":"x","__class__":1}]'.ljust(40),
+        pickle.dumps(("event", 1.0, 6, "x")),
+    ],
+)
+def test_what_is_no_message_ends_the_view_and_is_not_waited_for(tmp_path, bad):
+    good = live_message.encode("event", 1.0, 6, "x")
+    assert read_back(tmp_path, good + bad + good) == [("event", 1.0, 6, "x")]
+
+
+@given(data=st.binary(max_size=200), header=st.text(max_size=80))
+def test_any_bytes_are_a_message_or_none(data, header):
+    for message in (data, live_message.LENGTHS.pack(len(header.encode()), len(data)) + header.encode() + data):
+        with contextlib.suppress(live_message.BadMessage):
+            assert live_message.decode(message)[0] in live_message.WORDS
+
+
+def test_a_message_that_is_too_large_ends_the_view_not_the_flight(port):
+    feed = live.feed(port)
+    feed.tell("event", 0.0, 6, "x" * (live_message.MOST_HEADER + 1))
+    assert feed._lost
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
