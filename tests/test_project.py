@@ -75,6 +75,89 @@ def test_nothing_names_a_machine() -> None:
     assert not found
 
 
+# What turns bytes into code, or a text into a command. Pools of processes (and Dask, where asked for) unpickle what
+# their own parent sends, which is no file and no peer: README, "Security: who could do what".
+CODE_MODULES = {"pickle", "_pickle", "cPickle", "marshal", "shelve", "dill", "cloudpickle", "joblib", "pty", "code"}
+CODE_CALLS = {"eval", "exec", "compile", "__import__", "breakpoint"}
+CODE_ATTRIBUTES = {
+    *(
+        "os." + name
+        for name in ("system", "popen", "execl", "execle", "execlp", "execv", "execve", "execvp", "execvpe")
+    ),
+    *("os." + name for name in ("spawnl", "spawnle", "spawnlp", "spawnv", "spawnve", "spawnvp", "startfile")),
+    *("subprocess." + name for name in ("getoutput", "getstatusoutput")),
+    *("asyncio." + name for name in ("create_subprocess_shell",)),
+    *("pandas." + name for name in ("read_pickle", "eval")),
+    *("yaml." + name for name in ("load", "unsafe_load", "full_load")),
+    *("runpy." + name for name in ("run_path", "run_module")),
+}
+CODE_OPTIONS = {"shell", "allow_pickle"}
+
+
+def ways_into_code(text: str) -> list[str]:
+    """Where a module's source could run what somebody else wrote, a word each."""
+    found = []
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names = [node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)]
+        else:
+            names = []
+        found += [name for name in names if name.partition(".")[0] in CODE_MODULES or name in CODE_ATTRIBUTES]
+        if isinstance(node, ast.Attribute) and ast.unparse(node) in CODE_ATTRIBUTES:
+            found.append(ast.unparse(node))
+        if isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            if called in CODE_CALLS:
+                found.append(f"{called}()")
+            if called == "importlib.import_module" and not all(isinstance(word, ast.Constant) for word in node.args):
+                found.append("importlib.import_module() of a name that is made up")
+            options = [one for one in node.keywords if one.arg in CODE_OPTIONS]
+            found += [
+                f"{one.arg}=" for one in options if not (isinstance(one.value, ast.Constant) and not one.value.value)
+            ]
+    return found
+
+
+@pytest.mark.parametrize("name", [*MODULES, GENERATED])
+def test_nothing_that_a_file_or_a_peer_can_reach_runs_code(name: str) -> None:
+    assert not ways_into_code((ROOT / name).read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import pickle",
+        "from marshal import loads",
+        "import shelve as s",
+        "def f():\n    import pickle",
+        "eval(x)",
+        "exec('a')",
+        "__import__(name)",
+        "import os\nos.system(x)",
+        "from os import system",
+        "import subprocess\nsubprocess.run(x, shell=True)",
+        "np.load(path, allow_pickle=yes)",
+        "importlib.import_module(name)",
+    ],
+)
+def test_what_runs_code_is_found(source: str) -> None:
+    assert ways_into_code(source)
+
+
+def test_what_runs_no_code_is_not_found() -> None:
+    assert not ways_into_code("import re, os\nre.compile('a')\nsubprocess.run(['a'], shell=False)\nos.replace(a, b)")
+
+
+def test_processes_that_are_started_run_nothing_of_the_working_directory() -> None:
+    """`python -m` looks there first, unless told not to."""
+    for name in MODULES:
+        for node in ast.walk(ast.parse((ROOT / name).read_text(encoding="utf-8"))):
+            if isinstance(node, ast.List) and [ast.unparse(word) for word in node.elts[:1]] == ["sys.executable"]:
+                assert ast.unparse(node.elts[1]) == "'-P'", f"{name}:{node.lineno}"
+
+
 def test_constraints_are_exact_and_name_every_dependency() -> None:
     lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
     assert all(re.fullmatch(r"[A-Za-z0-9_.-]+==[\w.]+", line) for line in lines)

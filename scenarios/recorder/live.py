@@ -51,7 +51,8 @@ class LiveFeed:
         self._spool = os.fdopen(handle, "wb", buffering=0)
         words = [self._path, str(port), str(os.getpid()), *(("window",) if window else ())]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "scenarios.recorder.live_viewer", *words],
+            # -P: a file of the working directory that is called like one of ours is not run
+            [sys.executable, "-P", "-m", "scenarios.recorder.live_viewer", *words],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
