@@ -7,7 +7,8 @@ from pathlib import Path
 
 from scenarios.sweep.best_flights import FLIGHTS, BestFlights, Flights
 from scenarios.sweep.dataset import Dataset
-from scenarios.sweep.disagreements import Comparison, compare_flights, disagreements_text, write_disagreements
+from scenarios.sweep.disagreements import compare_flights, disagreements_text, write_disagreements
+from scenarios.sweep.flight_comparison import Comparison
 from scenarios.sweep.plan import Plan
 from scenarios.sweep.program import program_facts
 from scenarios.sweep.ranking import rank
