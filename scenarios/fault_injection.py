@@ -159,6 +159,12 @@ class FaultInjection:
             self._show(now_us * 1e-6, "")
 
     @property
+    def has_cut_link(self) -> bool:
+        """A fault that can keep the vehicle from being heard, or from hearing, has begun."""
+        cutting = (Where.LINK, Where.AUTOPILOT)
+        return any(one.start_us is not None and one.fault.where in cutting for one in self._planned)
+
+    @property
     def injected(self) -> tuple[InjectedFault, ...]:
         """What became of every fault, in the scenario's order."""
         told = []

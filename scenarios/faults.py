@@ -111,20 +111,20 @@ def _parse(table: KeyedTable, lengths_s: Mapping[str, float]) -> Fault:
     return Fault(kind, at_s, manoeuvre, duration_s, settings)
 
 
-def check_faults(
-    faults: Sequence[Fault], model: VehicleModel, *, own_autopilot: bool, own_plant: bool, link: str
-) -> None:
+def check_faults(faults: Sequence[Fault], model: VehicleModel, connect: str, plant: str = "") -> None:
     """Refuse what cannot be made to happen, before anything is flown.
 
     Args:
-        faults: of the scenario. model: what flies. own_autopilot: it is ours. own_plant: plant and sensors are, and in
-            this process. link: URL of the vehicle's link.
+        faults: of the scenario. model: what flies. connect: URL of the vehicle's link.
+        plant: where a real autopilot flies our plant: its simulator link, its serial port, or its build directory.
 
     Raises:
         UsageError: names the fault and what would do.
     """
     rotors = len(model.airframe.rotors)
-    foreign = not own_plant and not link.startswith("serial")
+    board = plant.startswith("serial")
+    own_autopilot = not plant and connect.startswith("memory")
+    foreign = not plant and not own_autopilot
     for number, fault in enumerate(faults):
         name = f"fault[{number}] ({fault.text})"
         motor = fault.settings.get("motor")
@@ -135,14 +135,14 @@ def check_faults(
                 f"{name}: only an autopilot of our own can be started anew in flight. Leave out --connect, --hil and "
                 "--px4, or the fault"
             )
-        if fault.where is Where.BODY and not own_plant:
+        if fault.where is Where.BODY and (foreign or board):
             flown_by = "a vehicle elsewhere has its own body" if foreign else "a board's plant is in another process"
             raise UsageError(
                 f"{name}: {flown_by}, out of our reach. Leave out --connect (or fly a PX4 on our plant with --px4 or "
                 "--hil tcpin://...), or leave out the fault"
             )
         if fault.where is Where.LINK:
-            _check_link(name, fault, link, foreign)
+            _check_link(name, fault, connect, foreign)
 
 
 def _check_link(name: str, fault: Fault, link: str, foreign: bool) -> None:

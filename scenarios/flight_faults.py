@@ -193,6 +193,7 @@ class FlightFaults:
 
         pilot.began = lambda manoeuvre: injection.begins(manoeuvre, client.now_us())
         pilot.over = lambda: injection.over(client.now_us())
+        pilot.excuses_silence = lambda: injection.has_cut_link
         self._drive = client.drive
         self._drive.watch(look)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bridge.client import Client
-from bridge.errors import CommandRefused
+from bridge.errors import CommandRefused, PeerSilent
 from scenarios.flight import Segment
 from scenarios.limits import LIMIT_CYCLE_RAD_S
 from scenarios.manoeuvres import EPSILON_S, Manoeuvre
@@ -82,6 +82,8 @@ class Pilot:
         """Called with a manoeuvre's name at its first set-point, and with "" when the take-off is under way."""
         self.over: Callable[[], object] = lambda: None
         """Called when the last manoeuvre is over, or the flight has ended before."""
+        self.excuses_silence: Callable[[], bool] = lambda: False
+        """Asked when the vehicle does not answer: is that the flight's own doing, whose link was made to fail?"""
         self._client = client
         self._scenario = scenario
         self._say = say
@@ -109,7 +111,9 @@ class Pilot:
                 self._sample_every(FAST_INTERVAL_US)
                 self._manoeuvre(manoeuvre)
                 self._sample_every(CRUISE_INTERVAL_US)
-        except (FlightEndedError, CommandRefused) as end:
+        except (FlightEndedError, CommandRefused, PeerSilent) as end:
+            if isinstance(end, PeerSilent) and not self.excuses_silence():
+                raise
             self.log.failure = str(end)
             self._say(2, f"flight ended: {end}")
         finally:
@@ -322,7 +326,8 @@ class Pilot:
             raise FlightEndedError("the vehicle disarmed in flight" + self._last_words())
         height = self._scenario.takeoff_altitude_m - (state.position_ned[2] - self._down) if state.position_ned else 0.0
         if height < least_height_m:
-            raise FlightEndedError(f"lost height: {height:.1f} m left of {self._scenario.takeoff_altitude_m:g} m")
+            left, of = max(0.0, height), self._scenario.takeoff_altitude_m
+            raise FlightEndedError(f"lost height: {left:.1f} m left of {of:g} m")
         if self._client.background is not None and len(self._signal) and state.nav_state != Mode.OFFBOARD:
             raise FlightEndedError("the vehicle left Offboard" + self._last_words())
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from bridge.clock import utc_stamp
 from scenarios import interrupts
+from scenarios.faults import check_faults
 from scenarios.flight import FlightRecord, RunRecord
 from scenarios.flown import Flown, Progress
 from scenarios.gain_set import GainSet, check, flies_gains, flight_gain_parameters, load_all
@@ -164,6 +165,7 @@ def _run_scenario(
         raise UsageError('no gain sets to fly: give --gains, for example "--gains table_7_2"')
     candidates = [plan(gain_set, scenario, model, profile) for gain_set in gain_sets]
     baseline = _baseline(gain_sets, scenario, model, profile)
+    check_faults(scenario.faults, model, options.connect, plant=options.hil or str(options.px4 or ""))
     folder = None
     started_utc = utc_stamp()
     if options.out is not None:

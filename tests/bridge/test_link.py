@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from bridge.errors import LinkClosed, LinkUrlError, PeerLost, PeerSilent, PortBusy
+from bridge.faulty_link import FaultyLink, LinkFault
 from bridge.link import Link, LossyLink, MemoryLink, open_link
 from bridge.serial_link import SerialLink
 from bridge.tcp_link import TcpLink, refuse_others, turn_out
@@ -60,6 +61,13 @@ def lossless_ends() -> tuple[Link, Link]:
     return LossyLink(first, np.random.default_rng(1)), second
 
 
+def faulty_ends() -> tuple[Link, Link]:
+    first, second = MemoryLink.pair()
+    faulty = FaultyLink(first, lambda: 0, 1)
+    faulty.begin(0, LinkFault())  # in force, and harmless
+    return faulty, second
+
+
 ENDS = {
     "memory": memory_ends,
     "udp": udp_ends,
@@ -67,6 +75,7 @@ ENDS = {
     "udp over IPv6": udp6_ends,
     "tcp": tcp_ends,
     "lossy, without loss": lossless_ends,
+    "faulty, with a harmless fault": faulty_ends,
 }
 
 
