@@ -6,10 +6,12 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+from scenarios.sweep.flown_beside import flown_beside
 from scenarios.sweep.pareto import front_of
 from scenarios.sweep.ranking import rank
 from scenarios.sweep.stored_sweep import stored_sweep
-from scenarios.sweep.sweep_text import disagreements_of, sweep_object, sweep_text
+from scenarios.sweep.sweep_object import sweep_object
+from scenarios.sweep.sweep_text import sweep_text
 from scenarios.sweep.winner import write_winner
 
 
@@ -29,8 +31,8 @@ def show_sweep(
         FileError: it is no sweep, or something cannot be written.
     """
     ranking = rank(stored_sweep(path))
-    front, disagreements = front_of(ranking), disagreements_of(path)
+    front, flown = front_of(ranking), flown_beside(path)
     files = {file.name: str(file) for file in write_winner(ranking, path)}
     if as_json:
-        return ranking.passing, json.dumps(sweep_object(ranking, front, disagreements, files), indent=2) + "\n"
-    return ranking.passing, sweep_text(ranking, front, disagreements, list(files), width=width, colour=colour)
+        return ranking.passing, json.dumps(sweep_object(ranking, front, flown, files), indent=2) + "\n"
+    return ranking.passing, sweep_text(ranking, front, flown, list(files), width=width, colour=colour)

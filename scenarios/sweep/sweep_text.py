@@ -1,50 +1,28 @@
-"""A sweep's result as text: verdict, ranking, cases, why points fail; and the same for machines."""
+"""A sweep's result as text: verdict, ranking, cases, why points fail, what was flown."""
 
 from __future__ import annotations
 
 import io
-import json
-import math
 import textwrap
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
-from scenarios.run_folder import plain
+from scenarios.sweep.flown_beside import FlownBeside
 from scenarios.sweep.pareto import Front
 from scenarios.sweep.ranking import CaseSummary, Ranking, Reason
+from scenarios.sweep.sweep_maps import influences
 from scenarios.sweep.sweep_words import limit_title, many, objective_heading, objective_title, shown_objective
 from scenarios.sweep.winner import worst_case_name
 from scenarios.table import MINIMUM_WIDTH, PIPED_WIDTH, UNSET, number, text_console
-from sitl.errors import FileError
 
-SCHEMA_VERSION = 1
 ROWS = 10
 """Candidates of the table for people."""
-JSON_ROWS = 100
-"""Candidates of the ranking and of the front for machines."""
+MOST_CASES = 40
 REASONS = 5
-DISAGREEMENTS = Path("flights") / "disagreements.json"
-
-
-def disagreements_of(folder: Path) -> list[dict[str, Any]]:
-    """What batch and flight do not agree about; empty if nothing was flown, or they do.
-
-    Args:
-        folder: of the sweep.
-
-    Raises:
-        FileError: the file is damaged.
-    """
-    path = folder / DISAGREEMENTS
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return []
-    except (OSError, ValueError) as error:
-        raise FileError(path, f"cannot be read: {error}", "Fly the best again: --resume with --fly K") from error
-    rows = found.get("disagreements", []) if isinstance(found, dict) else found
-    return [dict(one) for one in rows]
+_FIXED_WIDTH = 4 + 6 + 6 + 21 + 5 + 5 * 2
+"""Columns of a terminal that rank, number, cases passed, share and worst case take."""
+_NAME_WIDTH, _VALUE_WIDTH = 8, 9
+_GAP = 2
 
 
 def headline(ranking: Ranking) -> str:
@@ -132,7 +110,7 @@ def most_failing(case: CaseSummary) -> str:
 def sweep_text(
     ranking: Ranking,
     front: Front,
-    disagreements: Sequence[Mapping[str, Any]] = (),
+    flown: FlownBeside | None = None,
     files: Sequence[str] = (),
     *,
     width: int | None = None,
@@ -141,7 +119,7 @@ def sweep_text(
     """The whole result for people.
 
     Args:
-        ranking, front: of the sweep. disagreements: between batch and flight. files: that were written.
+        ranking, front: of the sweep. flown: what was flown of it; None: nothing. files: that were written.
         width: columns; None for `PIPED_WIDTH`. colour: with ANSI colours.
     """
     columns = max(width or PIPED_WIDTH, MINIMUM_WIDTH)
@@ -155,22 +133,28 @@ def sweep_text(
     if len(ranking.order):
         tell(f"{choice(ranking)}.")
         console.print()
-        console.print(_candidates(ranking, columns))
+        table, left_out = _candidates(ranking, columns)
+        console.print(table)
         if len(ranking.order) > ROWS:
-            tell(f"{len(ranking.order) - ROWS:,} more.")
+            tell(f"{len(ranking.order) - ROWS:,} more candidates. Objectives are those of the worst case.")
+        if left_out:
+            tell(f"Varied, too, with less effect: {', '.join(left_out)}; the report has them.")
         tell(_front_line(ranking, front))
     if ranking.points_done:
         console.print()
         console.print(_cases(ranking))
+        if len(ranking.cases) > MOST_CASES:
+            tell(f"{len(ranking.cases) - MOST_CASES:,} more cases; --json has them all.")
     for title, found in (("Why points fail", ranking.reasons), ("Points that could not be judged", ranking.failures)):
         if found:
             console.print(f"\n{title}:")
             for line in reason_lines(ranking, found):
                 tell(f"  {line}", "      ")
-    if disagreements:
-        console.print("\nBatch and flight disagree:")
-        for one in disagreements:
-            tell(f"  {disagreement_text(one)}", "      ")
+    if flown is not None:
+        console.print()
+        tell(flown.headline)
+        for line in flown.lines():
+            tell(f"  {line}", "      ")
     for line in unfinished(ranking):
         console.print()
         tell(line)
@@ -195,17 +179,6 @@ def reason_lines(ranking: Ranking, found: Sequence[Reason]) -> list[str]:
     return [*lines, f"{left:,} x otherwise"] if left else lines
 
 
-def disagreement_text(one: Mapping[str, Any]) -> str:
-    """A disagreement between batch and flight in one line.
-
-    Args:
-        one: of `disagreements.json`.
-    """
-    if isinstance(one.get("text"), str):
-        return str(one["text"])
-    return ", ".join(f"{key} {value}" for key, value in one.items())
-
-
 def _front_line(ranking: Ranking, front: Front) -> str:
     names = " and ".join(objective_heading(one) for one in ranking.sweep.objectives)
     who = "those that pass everywhere" if front.passing else "all, for none passes everywhere"
@@ -214,33 +187,46 @@ def _front_line(ranking: Ranking, front: Front) -> str:
     return f"Pareto front of {names} among {who}: {many(len(front.candidates), 'candidate')} ({shown_}{more})."
 
 
-def _candidates(ranking: Ranking, columns: int) -> Any:
+def _candidates(ranking: Ranking, columns: int) -> tuple[Any, tuple[str, ...]]:
+    """The table, and axes that it has no room for."""
     from rich import box
     from rich.table import Table
     from rich.text import Text
 
     sweep, cases = ranking.sweep, len(ranking.sweep.cases)
+    names = tuple(influences(ranking))
+    room = columns - _FIXED_WIDTH - sum(_width(objective_title(one)) + _GAP for one in sweep.objectives)
+    fitting = [k for k in range(len(names) + 1) if sum(_width(_broken(name)) + _GAP for name in names[:k]) <= room]
+    names, left_out = names[: max(1, fitting[-1])], names[max(1, fitting[-1]) :]
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
-    table.add_column("rank", justify="right")
-    table.add_column("candi-\ndate", justify="right")
-    for axis in sweep.axes:
-        table.add_column(axis.name.replace("RATE_", "RATE\n_"), justify="right", no_wrap=True)
-    table.add_column("cases\npassed", justify="right", no_wrap=True)
-    table.add_column("worst case passes\n% (95 % interval)", justify="right", no_wrap=True)
-    for one in sweep.objectives:
-        table.add_column(objective_title(one).replace(" ", "\n", 1), justify="right")
-    if cases > 1:
-        table.add_column("worst case", overflow="fold")
+    titles = ["rank", "candi-\ndate", *(_broken(axis.name) for axis in sweep.axes if axis.name in names)]
+    titles += ["cases\npassed", "worst case passes\n% (95 % interval)"]
+    titles += [objective_title(one).replace(" ", "\n") for one in sweep.objectives]
+    for title in (*titles, "worst\ncase"):
+        table.add_column(title, justify="right", no_wrap=True)
     for place, candidate in enumerate(ranking.order[:ROWS].tolist(), 1):
         style = "green" if ranking.everywhere[candidate] else "red"
         row = [Text(str(place)), Text(str(candidate))]
-        row += [Text(f"{value:.5g}") for value in ranking.values_of(candidate).values()]
+        row += [Text(f"{value:.4g}") for name, value in ranking.values_of(candidate).items() if name in names]
         row += [Text(f"{ranking.passed[candidate]}/{cases}", style=style)]
         row += [Text(worst_text(ranking, candidate).replace(" %", ""))]
         for k, one in enumerate(sweep.objectives):
             row.append(Text(shown_objective(one, ranking.objective(candidate, k), unit=False)))
-        table.add_row(*row, *([Text(worst_case_name(ranking, candidate))] if cases > 1 else []))
-    return table
+        table.add_row(*row, Text(str(ranking.worst_case[candidate])))
+    return table, left_out
+
+
+def _broken(name: str) -> str:
+    """A parameter's name on several lines, none of them long."""
+    lines = [""]
+    for word in name.split("_"):
+        whole = f"{lines[-1]}_{word}" if lines[-1] else word
+        lines = [*lines[:-1], whole] if len(whole) <= _NAME_WIDTH or not lines[-1] else [*lines, f"_{word}"]
+    return "\n".join(lines)
+
+
+def _width(title: str) -> int:
+    return max(_VALUE_WIDTH, *(len(line) for line in title.replace(" ", "\n").splitlines()))
 
 
 def _cases(ranking: Ranking) -> Any:
@@ -249,103 +235,21 @@ def _cases(ranking: Ranking) -> Any:
     from rich.text import Text
 
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 2, 0, 0), show_edge=False, pad_edge=False)
+    table.add_column("no.", justify="right")
     table.add_column("case", overflow="fold")
     for title in ("passing", "of", "share %", "errors"):
         table.add_column(title, justify="right")
     table.add_column("fails most often by")
-    for case in ranking.cases:
+    for place, case in enumerate(ranking.cases[:MOST_CASES]):
         share = UNSET if not case.points else f"{100.0 * case.passing / case.points:.1f}"
-        row = (case.name, f"{case.passing:,}", f"{case.points:,}", share, f"{case.errors:,}", most_failing(case))
+        row = (
+            str(place),
+            case.name,
+            f"{case.passing:,}",
+            f"{case.points:,}",
+            share,
+            f"{case.errors:,}",
+            most_failing(case),
+        )
         table.add_row(*(Text(cell) for cell in row))
     return table
-
-
-def sweep_object(
-    ranking: Ranking, front: Front, disagreements: Sequence[Mapping[str, Any]], files: Mapping[str, str]
-) -> dict[str, Any]:
-    """The result for machines; units are in the keys.
-
-    Args:
-        ranking, front: of the sweep. disagreements: between batch and flight. files: what -> path.
-    """
-    sweep = ranking.sweep
-    best = ranking.best
-    everything: dict[str, Any] = plain(
-        {
-            "schema_version": SCHEMA_VERSION,
-            "folder": str(sweep.path),
-            "name": sweep.name,
-            "title": sweep.title,
-            "points": sweep.facts["points"],
-            "points_done": ranking.points_done,
-            "complete": ranking.points_done == sweep.facts["points"],
-            "candidates": sweep.candidates,
-            "candidates_ranked": len(ranking.order),
-            "candidates_incomplete": ranking.incomplete,
-            "passing_everywhere": ranking.passing,
-            "errors": sum(case.errors for case in ranking.cases),
-            "winner": candidate_object(ranking, best, 1) if best is not None and ranking.passing else None,
-            "best": None if best is None else candidate_object(ranking, best, 1),
-            "objectives": [one.column for one in sweep.objectives],
-            "ranking": [candidate_object(ranking, c, k) for k, c in enumerate(ranking.order[:JSON_ROWS].tolist(), 1)],
-            "pareto": {
-                "among": "passing_everywhere" if front.passing else "all",
-                "count": len(front.candidates),
-                "candidates": front.candidates[:JSON_ROWS].tolist(),
-            },
-            "cases": [
-                {
-                    "name": case.name,
-                    "points": case.points,
-                    "passing": case.passing,
-                    "passing_pct": 100.0 * case.passing / case.points if case.points else None,
-                    "errors": case.errors,
-                    "samples_of_failing": case.samples,
-                    "samples_breaking": dict(case.failing),
-                }
-                for case in ranking.cases
-            ],
-            "reasons": [_reason_object(one) for one in ranking.reasons[:JSON_ROWS]],
-            "error_reasons": [_reason_object(one) for one in ranking.failures[:JSON_ROWS]],
-            "disagreements": list(disagreements),
-            "problems": list(ranking.problems),
-            "files": dict(files),
-        }
-    )
-    return everything
-
-
-def candidate_object(ranking: Ranking, candidate: int, place: int) -> dict[str, Any]:
-    """A candidate for machines.
-
-    Args:
-        ranking: of a sweep. candidate: its number. place: in the order, from 1.
-    """
-    interval = ranking.interval_pct(candidate) or (None, None)
-    return {
-        "rank": place,
-        "candidate": candidate,
-        "parameters": ranking.values_of(candidate),
-        "passes_everywhere": bool(ranking.everywhere[candidate]),
-        "cases_passed": int(ranking.passed[candidate]),
-        "cases": len(ranking.sweep.cases),
-        "errors": int(ranking.errors[candidate]),
-        "worst_case": worst_case_name(ranking, candidate),
-        "worst_pass_pct": ranking.worst_pct(candidate),
-        "worst_pass_low_pct": interval[0],
-        "worst_pass_high_pct": interval[1],
-        "objectives": {
-            one.column: _finite(ranking.objective(candidate, k)) for k, one in enumerate(ranking.sweep.objectives)
-        },
-    }
-
-
-def _finite(value: float) -> float | str | None:
-    """An infinite margin is no missing one."""
-    if math.isinf(value):
-        return "inf" if value > 0 else "-inf"
-    return None if math.isnan(value) else value
-
-
-def _reason_object(one: Reason) -> dict[str, Any]:
-    return {"reason": one.text, "points": one.points, "first_candidate": one.candidate, "first_case": one.case}
