@@ -1,31 +1,21 @@
-"""MAVProxy: parameters, a flight, missions, logs, files."""
+"""MAVProxy: parameters, a flight, missions."""
 
 from __future__ import annotations
 
-import time
-import zlib
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
-from mavproxy_console import MODULES, Console
+from mavproxy_console import Console
 from vehicle_process import VehicleProcess
 
 from sitl.parameters import parameter_specs
 
 pytestmark = pytest.mark.client
 
-param_ftp = pytest.importorskip("MAVProxy.modules.lib.param_ftp")
-
 
 @pytest.fixture(scope="module")
-def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("logs")
-
-
-@pytest.fixture(scope="module")
-def vehicle(sitl: Callable[..., VehicleProcess], logs: Path) -> VehicleProcess:
-    return sitl("--log-dir", str(logs), speed=3.0, mode="gcs")
+def vehicle(sitl: Callable[..., VehicleProcess]) -> VehicleProcess:
+    return sitl(speed=3.0, mode="gcs")
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +23,6 @@ def mavproxy(vehicle: VehicleProcess, tmp_path_factory: pytest.TempPathFactory) 
     """One MAVProxy for the tests of this file: it takes seconds to start."""
     with Console(vehicle.port, tmp_path_factory.mktemp("mavproxy")) as console:
         assert console.parameters() == len(parameter_specs())
-        # As PX4's simulator it writes a log from the start on; this ends that one.
-        console.say("param set SDLOG_MODE 0")
-        assert console.fetched("SDLOG_MODE", "0")
         yield console
 
 
@@ -107,74 +94,3 @@ def test_a_flight(mavproxy: Console) -> None:
     mavproxy.say("long NAV_LAND 0 0 0 nan nan nan nan")
     mavproxy.until(r"Got COMMAND_ACK: NAV_LAND: ACCEPTED")
     mavproxy.until(r"DISARMED", limit_s=40.0)
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_the_log_of_that_flight(
-    mavproxy: Console, logs: Path, sitl: Callable[..., VehicleProcess], tmp_path: Path
-) -> None:
-    pyulog = pytest.importorskip("pyulog")
-    time.sleep(1.0)  # the log goes on for a second after the flight
-    mavproxy.say("log list")
-    size = int(mavproxy.until(r"Log 1  numLogs 2 lastLog \d+ size (\d+) ")[1])
-    # At its own pace: MAVProxy never finishes a download whose end came before what it missed.
-    slow = sitl("--log-dir", str(logs), mode="gcs")
-    path = tmp_path / "flight.ulg"
-    with Console(slow.port, tmp_path) as reader:
-        reader.parameters()
-        reader.say("log list")
-        downloaded(reader, int(reader.until(rf"Log (\d+)  numLogs 3 lastLog \d+ size {size} ")[1]), path)
-    slow.stop()
-    assert path.stat().st_size == size
-    log = pyulog.ULog(str(path))
-    assert not log.file_corruption
-    assert -log.get_dataset("vehicle_local_position").data["z"].min() > 3.0
-
-
-def downloaded(mavproxy: Console, number: int, path: Path) -> None:
-    """Download a log, again if it comes to no end."""
-    for limit_s in (40.0, 60.0, 60.0):
-        mavproxy.say(f"log download {number} {path.name}")
-        try:
-            mavproxy.until(rf"Finished downloading {path.name}", limit_s)
-            return
-        except AssertionError:
-            mavproxy.say("log cancel")
-    raise AssertionError(f"log {number} never came whole")
-
-
-def test_files(sitl: Callable[..., VehicleProcess], tmp_path: Path) -> None:
-    # A vehicle of its own: the other MAVProxy holds the port of the first.
-    own = sitl(mode="gcs")
-    specs = parameter_specs()
-    with Console(own.port, tmp_path, modules=f"{MODULES},ftp") as mavproxy:
-        # It asks for a file that a PX4 has not, too, and then for the list.
-        assert mavproxy.parameters() == len(specs)
-        mavproxy.say("param show MC_ROLL_P")
-        mavproxy.until(rf"MC_ROLL_P\s+{specs['MC_ROLL_P'].default}")
-        mavproxy.say("ftp list /etc/extras")
-        name, size = mavproxy.until(r"\s+(component_general\S+)\t(\d+)").groups()
-        mavproxy.say(f"ftp get /etc/extras/{name} {name}")
-        mavproxy.until(rf"Wrote {size} bytes to {name}")
-        written(tmp_path / name, int(size))
-        mavproxy.say(f"ftp crc /etc/extras/{name}")
-        mavproxy.until(rf"crc: /etc/extras/{name} 0x{crc32(tmp_path / name):08x}")
-        mavproxy.say("ftp get @PARAM/param.pck param.pck")
-        written(tmp_path / "param.pck", int(mavproxy.until(r"Wrote (\d+) bytes to param.pck")[1]))
-        packed = param_ftp.ftp_param_decode((tmp_path / "param.pck").read_bytes())
-        assert {name.decode() for name, _, _ in packed.params} == set(specs)
-    own.stop()
-
-
-def written(path: Path, size: int) -> None:
-    """Wait until MAVProxy has put all of a file on the disk, a little later than it says."""
-    for _ in range(100):
-        if path.stat().st_size == size:
-            return
-        time.sleep(0.05)
-    raise AssertionError(f"{path} is not {size} bytes long")
-
-
-def crc32(path: Path) -> int:
-    """The checksum MAVFTP asks for: CRC-32 without its two inversions."""
-    return ~zlib.crc32(path.read_bytes(), 0xFFFFFFFF) & 0xFFFFFFFF
