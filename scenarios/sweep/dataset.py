@@ -131,6 +131,7 @@ class Dataset:
         try:
             self.points.mkdir(parents=True, exist_ok=True)
         except OSError as error:
+            self._leave()
             raise FileError(
                 self.path, f"cannot be made: {error.strerror}", "Choose another folder with --out"
             ) from error
@@ -146,7 +147,18 @@ class Dataset:
             **facts,
             "plan": plan.description(),
         }
-        self._write(self.path / SWEEP_JSON, json.dumps(known, indent=2, default=str).encode() + b"\n")
+        try:
+            self._write(self.path / SWEEP_JSON, json.dumps(known, indent=2, default=str).encode() + b"\n")
+        except FileError as error:
+            self._leave()
+            raise FileError(error.path, error.problem, "Free some space, or choose another folder with --out") from None
+
+    def _leave(self) -> None:
+        """Nothing has begun: no folder either, unless somebody else has put something in it."""
+        with contextlib.suppress(OSError):
+            self.points.rmdir()
+        with contextlib.suppress(OSError):
+            self.path.rmdir()
 
     def facts(self) -> dict[str, Any]:
         """What `sweep.json` says.

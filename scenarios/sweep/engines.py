@@ -7,12 +7,13 @@ result is the same whoever worked it out.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+import threading
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from itertools import count
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from typing import Protocol
 
 from scenarios import interrupts
@@ -36,6 +37,14 @@ class Result:
     task: Task
     columns: Columns
     lost: int = 0
+
+
+class Rows(Protocol):
+    """What works chunks out: an `Evaluator`, for all but tests."""
+
+    def rows(self, task: Task) -> Columns:
+        """The rows of a chunk."""
+        ...
 
 
 class Engine(Protocol):
@@ -81,13 +90,22 @@ class InProcess:
             yield Result(task, self._evaluator.rows(task))
 
 
-_evaluator: Evaluator | None = None
+_evaluator: Rows | None = None
 
 
-def _begin(plan: Plan) -> None:
+def _begin(plan: Plan, make: Callable[[Plan], Rows]) -> None:
     """A worker keeps its evaluator: samples and matrices of a case are made once."""
     global _evaluator
-    _evaluator = Evaluator(plan)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _evaluator = make(plan)
+
+
+def _end_with_parent() -> None:
+    """A killed parent tells nobody; a worker would wait for its next chunk for ever."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _work(task: Task) -> Columns:
@@ -112,14 +130,14 @@ class Processes:
     That chunk is given out once more; the points of one that kills its worker again are rows with the reason.
 
     Args:
-        plan: of the sweep. workers: processes; 0 takes one a core.
+        plan: of the sweep. workers: processes; 0 takes one a core. make: makes what works chunks out, in a worker.
     """
 
     name = "processes"
 
-    def __init__(self, plan: Plan, workers: int = 0) -> None:
+    def __init__(self, plan: Plan, workers: int = 0, make: Callable[[Plan], Rows] = Evaluator) -> None:
         self.workers = workers or os.cpu_count() or 1
-        self._plan = plan
+        self._plan, self._make = plan, make
         self._executors: list[ProcessPoolExecutor] = []
         self._running: dict[Future[Columns], _Given] = {}
         self._again: list[tuple[Task, int]] = []
@@ -138,7 +156,7 @@ class Processes:
 
     def _executor(self) -> ProcessPoolExecutor:
         # spawn: a forked child of a process that has started Arrow's threads may hang
-        return ProcessPoolExecutor(1, get_context("spawn"), initializer=_begin, initargs=(self._plan,))
+        return ProcessPoolExecutor(1, get_context("spawn"), initializer=_begin, initargs=(self._plan, self._make))
 
     def run(self, tasks: Iterable[Task]) -> Iterator[Result]:
         """Results as they come: each worker has one chunk in hand and one waiting."""

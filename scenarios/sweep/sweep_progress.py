@@ -44,7 +44,13 @@ def watching(plan: Plan, engine: Engine, tell: Callable[[str], object]) -> Itera
     with bar:
         task = bar.add_task("", total=plan.points, text="the first time compiles the laws: half a minute")
 
+        told = False
+
         def show(now: Progress) -> None:
+            nonlocal told
+            if not told:
+                told = True
+                tell(_first_line(now, engine))
             if now.done > now.begun_with:
                 bar.update(task, completed=now.done, text=rate.text(now, plan))
             else:
@@ -91,14 +97,17 @@ class _Lines:
     def __call__(self, now: Progress) -> None:
         at = self._rate.clock.now_us()
         if self._next_us is None:
-            engine = f"{self._engine.workers} worker{'s' * (self._engine.workers > 1)}, {self._engine.name}"
-            before = f", {now.begun_with:,} of them done before" if now.begun_with else ""
-            self._tell(f"{now.points:,} points{before}; {engine}")
+            self._tell(_first_line(now, self._engine))
         elif at >= self._next_us or now.done == now.points:
             self._tell(f"{now.done:,} of {now.points:,} points: {self._rate.text(now, self._plan)}")
         else:
             return
         self._next_us = at + round(LINE_EVERY_S * 1e6)
+
+
+def _first_line(now: Progress, engine: Engine) -> str:
+    before = f", {now.begun_with:,} of them done before" if now.begun_with else ""
+    return f"{now.points:,} points{before}; {engine.workers} worker{'s' * (engine.workers > 1)}, {engine.name}"
 
 
 def _duration(seconds: float) -> str:
