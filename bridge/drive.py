@@ -54,6 +54,10 @@ class Drive(ABC):
         """Vehicle time, us, that also goes on while nothing is heard of the vehicle."""
         return self.now_us()
 
+    def wire_us(self) -> int:
+        """Time on the link, us: the vehicle's, or the wall clock's where the vehicle's is what its messages say."""
+        return self.now_us()
+
     def watch(self, look: Callable[[int], object] | None) -> None:
         """Have vehicle time looked at as closely as it is known.
 
@@ -120,7 +124,7 @@ class NetworkDrive(Drive):
     def __init__(self, patience_s: float = 5.0, clock: Clock | None = None) -> None:
         self.patience_s = patience_s
         self._clock: Clock = clock or WallClock()
-        self._now_us = 0
+        self._now_us = self._running_us = 0
         self._knows_time = False
         self._looked_us = self._heard_at_us = self._clock.now_us()
         self._waited_us = 0
@@ -136,8 +140,14 @@ class NetworkDrive(Drive):
         return self._knows_time
 
     def running_us(self) -> int:
-        """Latest vehicle time heard, and as much wall time as has passed since."""
-        return self._now_us + (self._clock.now_us() - self._heard_at_us if self._knows_time else 0)
+        """Latest vehicle time heard, and as much wall time as has passed since; it never goes back."""
+        if self._knows_time:
+            self._running_us = max(self._running_us, self._now_us + self._clock.now_us() - self._heard_at_us)
+        return self._running_us
+
+    def wire_us(self) -> int:
+        """The wall clock."""
+        return self._clock.now_us()
 
     def heard(self, time_us: int) -> None:
         """A message carried this vehicle time; a jump back means that the vehicle started anew."""

@@ -43,7 +43,7 @@ class FaultyLink(Link):
 
     Args:
         link: the link underneath; it should keep datagrams whole.
-        now_us: vehicle time; it must go on while nothing comes.
+        now_us: time in which datagrams are late; it never goes back and goes on while nothing comes.
         seed: of what is left to chance.
     """
 

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from sitl.vehicle_spec import VehicleModel
 
 MAX_FAULTS = 100
+LATEST_S = 0.4
+"""So late may datagrams of a vehicle elsewhere come: from one that is a second late it seems to have started anew."""
+
 LONGEST_SILENCE_S = 3.0
 """So long a vehicle elsewhere may be cut off: after five seconds without a word of it a flight gives it up."""
 
@@ -142,14 +145,20 @@ def check_faults(faults: Sequence[Fault], model: VehicleModel, connect: str, pla
                 "--hil tcpin://...), or leave out the fault"
             )
         if fault.where is Where.LINK:
-            _check_link(name, fault, connect, foreign)
+            _check_link(name, fault, connect, elsewhere=foreign or board)
 
 
-def _check_link(name: str, fault: Fault, link: str, foreign: bool) -> None:
+def _check_link(name: str, fault: Fault, link: str, *, elsewhere: bool) -> None:
     if link.startswith("tcp"):
         raise UsageError(f"{name}: {link} is a stream without datagrams to lose. Connect over udpin:// or udpout://")
+    late_s = max(fault.settings.get("delay_s", 0.0), fault.settings.get("jitter_s", 0.0))
+    if elsewhere and late_s > LATEST_S:
+        raise UsageError(
+            f"{name}: a vehicle elsewhere is known by the times that it sends, and would seem to have started anew. "
+            f"Give {LATEST_S:g} s at most"
+        )
     silent = fault.settings.get("loss_pct", 0.0) >= 100.0 and fault.settings["direction"] != "to_vehicle"
-    if foreign and silent and (fault.duration_s is None or fault.duration_s > LONGEST_SILENCE_S):
+    if elsewhere and silent and (fault.duration_s is None or fault.duration_s > LONGEST_SILENCE_S):
         raise UsageError(
             f"{name}: a vehicle elsewhere that is cut off for long would be given up, not landed. Give duration_s of "
             f"{LONGEST_SILENCE_S:g} at most, or less loss_pct"

@@ -146,7 +146,7 @@ class FlightFaults:
     def on_link(self, link: Link, drive: Drive) -> Link:
         """The link for the client to use: the same one, if nothing happens to it."""
         if any(fault.where in (Where.LINK, Where.AUTOPILOT) for fault in self._faults):
-            self._link = FaultyLink(link, drive.running_us, self._job.scenario.seed)
+            self._link = FaultyLink(link, drive.wire_us, self._job.scenario.seed)
         return self._link or link
 
     @property

@@ -235,3 +235,7 @@ def test_over_a_network_time_runs_on_while_nothing_is_heard() -> None:
     drive.watch(seen.append)
     drive.wait(MemoryLink.pair()[0], 0)
     assert (drive.now_us(), seen) == (10_000_000, [10_300_000])
+    drive.heard(10_100_000)  # it was late: time does not go back
+    assert (drive.now_us(), drive.running_us(), drive.wire_us()) == (10_100_000, 10_300_000, wall.now)
+    wall.now += 300_000
+    assert drive.running_us() == 10_400_000

@@ -246,6 +246,12 @@ class TestWhatCannotBeDone:
         with pytest.raises(UsageError, match="Connect over udpin"):
             self.check("link_loss", "tcpout://127.0.0.1:5760")
 
+    @pytest.mark.parametrize(("kind", "key"), [("link_delay", "delay_s"), ("link_jitter", "jitter_s")])
+    def test_nor_is_a_vehicle_elsewhere_so_late_that_it_seems_another(self, kind: str, key: str) -> None:
+        self.check(kind, "udpin://127.0.0.1:14540", **{key: 0.4})
+        with pytest.raises(UsageError, match="seem to have started anew"):
+            self.check(kind, "udpin://127.0.0.1:14540", **{key: 0.5})
+
     def test_a_vehicle_elsewhere_is_not_cut_off_for_long(self) -> None:
         keys: dict[str, Any] = {"connect": "udpin://127.0.0.1:14540", "loss_pct": 100.0}
         self.check("link_loss", **keys, duration_s=2.0)

@@ -25,6 +25,7 @@ from px4_stand_in import Faults, StandIn
 from bridge.errors import HilUnfit
 from scenarios import hil_session
 from scenarios.cli import main
+from scenarios.faults import parse_faults
 from scenarios.flight import FlightRecord
 from scenarios.limits import Outcome
 from scenarios.manoeuvres import make_manoeuvre
@@ -32,6 +33,7 @@ from scenarios.runner import RunOptions, RunResult, run_scenario
 from scenarios.scenario import Scenario, load_scenario
 
 SETTLES = "table_7_2/ADAM-0"
+BASELINE = "table_2_2/ANT-X"
 STEP = {"amplitude_deg": 10.0, "hold_s": 2.0, "return_s": 0.6}
 
 
@@ -177,6 +179,35 @@ class TestTheSameFlight:
     def test_the_autopilot_has_its_own_parameters_back(self, both: Both) -> None:
         assert both.wired.values() == both.wired.before
         assert not both.wired.brain.armed
+
+
+def test_faults_of_plant_sensors_and_link_do_the_same_to_both(wired: Callable[..., Wired]) -> None:
+    step = make_manoeuvre("step", amplitude_deg=10.0, hold_s=3.0, return_s=0.6)
+    at = {"manoeuvre": "step", "at_s": 1.2}
+    faults = (
+        {"kind": "gust", "side_force_n": 1.0, "roll_accel_deg_s2": 300.0, "duration_s": 0.5, **at},
+        {"kind": "motor_efficiency", "motor": 1, "efficiency_pct": 90.0, "duration_s": 0.5, **at},
+        {"kind": "loop_delay", "delay_ticks": 2, **at},
+        {"kind": "link_loss", "loss_pct": 20.0, **at},
+        {"kind": "parameter", "parameter": "MC_ROLL_P", "value": 6.0, **at},
+    )
+    planned = parse_faults(list(faults), Path("test.toml"), (step,))
+    flown = scenario(BASELINE, manoeuvres=(step,), faults=planned)
+    one = wired()
+    result = run_scenario(flown, one.options(out=None))
+    assert result.stopped is None
+    (twin,) = result.run.twins
+    assert [fault.text for fault in twin.flight.faults] == [fault.text for fault in planned]
+    for theirs, ours in zip(twin.flight.faults, twin.own.faults, strict=True):
+        begin_s, own_begin_s = (record.segments[0].start_s for record in (twin.flight, twin.own))
+        assert theirs.start_s is not None
+        assert ours.start_s is not None
+        assert theirs.start_s - begin_s == pytest.approx(ours.start_s - own_begin_s, abs=0.0041)
+    deviations = [record.metric("fault_roll_deviation_deg") for record in (twin.flight, twin.own)]
+    values = [metric.value for metric in deviations if metric is not None and metric.value is not None]
+    assert values[0] > 3.0
+    assert values[0] == pytest.approx(values[1], abs=0.3)
+    assert one.values() == one.before
 
 
 def run_cli(*words: str) -> tuple[int, str, str]:
