@@ -21,6 +21,7 @@ Source: PX4 src/modules/mavlink/mavlink_ftp.cpp; MAVLink's file transfer protoco
 from __future__ import annotations
 
 import errno
+from itertools import islice
 from typing import Final
 
 from bridge.ftp_files import FileTree
@@ -69,6 +70,10 @@ class _Refused(Exception):
 
     def __init__(self, error: FtpError) -> None:
         self.error = error
+
+
+class _Unanswered(Exception):
+    """A request too many: it is as if it had been lost on the way."""
 
 
 class _Masked(Exception):
@@ -121,6 +126,8 @@ class FtpServer:
                 return []  # asked again before it was done
             link.drop_checksum()
         link.last = None
+        if request.opcode != Opcode.LIST:
+            link.listing.end()
         try:
             if request.opcode == Opcode.BURST:
                 self._session(link, request)
@@ -129,6 +136,9 @@ class FtpServer:
             if request.opcode == Opcode.CRC:
                 return self._checksum(link, request)
             answer = self._work(link, request)
+        except _Unanswered:
+            self.refused += 1
+            return []
         except (_Refused, _Masked, OSError) as error:
             return [self._fail(link, request, error)]
         return [self._reply(link, request, ACK, answer)]
@@ -223,15 +233,19 @@ class FtpServer:
 
     def _list(self, link: Link, path: str, offset: int) -> bytes:
         """As many entries as fit, from the one numbered `offset` on."""
+        listing, now_us = link.listing, link.active_us
         try:
-            entries = self.files.entries(path)
+            if not listing.has_page(path, offset, now_us):
+                if not listing.may_look(now_us):
+                    raise _Unanswered
+                listing.begin(path, self.files.entries(path), now_us)
         except OSError as error:
             if error.errno == errno.EACCES:
                 raise
             link.errno = error.errno or 0
             raise _Refused(FtpError.NOT_FOUND) from None
         data = b""
-        for entry in entries[offset:]:
+        for entry in islice(listing.entries, offset, None):
             line = line_of(entry)
             if len(data) + len(line) > DATA_BYTES:
                 return data

@@ -17,6 +17,9 @@ from typing import Final, NamedTuple, Protocol, TypeAlias
 FOLDER_SIZE: Final = 4096
 """Size a folder is said to have, in bytes, as the file system of a PX4 SITL says."""
 
+LARGEST_FILE: Final = 0xFFFF_FFFF
+"""Bytes of a file that can be asked for: an offset has 32 bits. A larger file ends there."""
+
 MOST_ENTRIES: Final = 10_000
 """Most entries of one real directory that are shown."""
 
@@ -218,12 +221,12 @@ class OpenReal:
 
     def __init__(self, descriptor: int, size: int) -> None:
         self._descriptor = descriptor
-        self.size = size
+        self.size = min(size, LARGEST_FILE)
 
     def read(self, offset: int, size: int) -> bytes:
         """See OpenFile."""
         os.lseek(self._descriptor, offset, os.SEEK_SET)
-        return os.read(self._descriptor, size)
+        return os.read(self._descriptor, min(size, LARGEST_FILE - offset))
 
     def write(self, offset: int, data: bytes) -> int:
         """Raise EBADF: it is open for reading."""

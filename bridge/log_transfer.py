@@ -36,6 +36,13 @@ PACED_BURST: Final = 5
 
 LIST_TO_END: Final = 0xFFFF
 _UINT32_MAX = 0xFFFFFFFF
+_OPEN_FLAGS: Final = (
+    os.O_RDONLY
+    | getattr(os, "O_NOFOLLOW", 0)
+    | getattr(os, "O_NONBLOCK", 0)  # should a FIFO have taken its place
+    | getattr(os, "O_CLOEXEC", 0)
+    | getattr(os, "O_BINARY", 0)
+)
 _RESCAN_US = 100_000
 
 
@@ -194,7 +201,7 @@ class LogServer:
             link.close()
             log = link.logs[number]
             try:
-                link.file = os.open(log.path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0))
+                link.file = os.open(log.path, _OPEN_FLAGS)
             except OSError:
                 self.refused += 1  # deleted meanwhile
                 return
