@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scenarios.scenario import ASSUMPTION_RANGES
+from sitl.errors import FileError
 from sitl.keyed_table import KeyedTable, nearest
 from sitl.parameters import ParameterSpec, parameter_specs
 from sitl.profile import PROFILES, Profile
@@ -26,6 +27,8 @@ CONDITIONS = (VEHICLE, SCALING, PROFILE, *PROFILE_ITEMS, *ASSUMPTIONS)
 
 MOST_VALUES = 100_000
 """Values of one axis."""
+
+_LARGEST = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True)
@@ -106,9 +109,8 @@ def parse_axes(
             known = f"An axis is a PX4 parameter, or one of {', '.join(CONDITIONS)}"
             raise table.error(name, f"no such parameter or condition{near}", known)
     if not parameters:
-        raise table.error(
-            "", "no PX4 parameter is varied", "Add one, such as MC_ROLLRATE_P = { from = 0.05, to = 0.3 }"
-        )
+        remedy = "Add one, such as MC_ROLLRATE_P = { from = 0.05, to = 0.3 }"
+        raise FileError(table.path, "axes: no PX4 parameter is varied", remedy)
     return tuple(parameters), tuple(conditions)
 
 
@@ -123,6 +125,8 @@ def _parameter(table: KeyedTable, name: str, spec: ParameterSpec, sampled: bool)
         span.finish()
         if low >= high:
             raise span.error("from", f"{low:g} is not below to = {high:g}", "Swap them, or give a list of values")
+        for key, end in (("from", low), ("to", high)):
+            _storable(span, key, end, end, integer)
         if not count and not sampled:
             raise span.error("count", "missing key: a grid needs to know how many values", "Add count = 10")
         axis = ParameterAxis(name, integer, (), low, high, log)
@@ -132,11 +136,17 @@ def _parameter(table: KeyedTable, name: str, spec: ParameterSpec, sampled: bool)
             return dataclasses.replace(axis, values=values, low=min(values), high=max(values))
         return axis
     numbers = [_number(table, name, one) for one in _list(table, name, value)]
-    stored = as_stored(np.array(numbers), integer)
-    if integer and stored.tolist() != numbers:
-        raise table.error(name, f"{value!r}: PX4 keeps it as a whole number", "Give whole numbers")
-    values = _distinct(stored)
+    for one, number in zip(value, numbers, strict=True):
+        _storable(table, name, one, number, integer)
+    values = _distinct(as_stored(np.array(numbers), integer))
     return ParameterAxis(name, integer, values, min(values), max(values))
+
+
+def _storable(table: KeyedTable, key: str, shown: object, value: float, integer: bool) -> None:
+    if integer and (value != int(value) or not -(2**31) <= value < 2**31):
+        raise table.error(key, f"{shown!r}: PX4 keeps it as a whole number", "Give whole numbers of 32 bits")
+    if not integer and abs(value) > _LARGEST:
+        raise table.error(key, f"{shown!r} is more than PX4 can keep", "Give a number of 32 bits")
 
 
 def _distinct(values: FloatArray) -> tuple[float, ...]:
@@ -178,13 +188,17 @@ def _condition(table: KeyedTable, name: str) -> ConditionAxis:
             raise span.error("count", "missing key: every candidate is judged under each of them", "Add count = 5")
         count, log = _count(span), _scale(span, low)
         span.finish()
-        made = np.geomspace(low, high, count) if log else np.linspace(low, high, count)
-        return ConditionAxis(name, tuple(dict.fromkeys(made.tolist())))
-    values = _list(table, name, [value] if isinstance(value, int | float) else value)
+        if low > high:
+            raise span.error("from", f"{low:g} is not below to = {high:g}", "Swap them, or give a list of values")
+        values = (np.geomspace(low, high, count) if log else np.linspace(low, high, count)).tolist()
+    else:
+        values = _list(table, name, [value] if isinstance(value, int | float) else value)
     for one in values:
         if not isinstance(one, bool | int | float):
             raise table.error(name, f"{one!r} is not a number", "Give numbers without quotes")
-        if name in ASSUMPTION_RANGES and name in ASSUMPTIONS:
+        if isinstance(one, bool) != isinstance(values[0], bool):
+            raise table.error(name, f"{values!r} has both true or false and numbers", "Give values of one kind")
+        if name in ASSUMPTIONS:
             low, high = ASSUMPTION_RANGES[name]
             if isinstance(one, bool) or not low <= one <= high:
                 raise table.error(name, f"{one!r} is out of range", f"It must be from {low:g} to {high:g}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
@@ -25,7 +26,7 @@ NOISY_RAD_S = 0.01
 CLOSE_DEG = 0.3
 """Roll angles no further apart than this are one flight: what differs then is how a metric is read off."""
 
-_NOT_STILL = "not level, still and at height"
+_NOT_STILL = re.compile(r": not level, still and at height within \S+ s")
 
 
 def explained(plan: Plan, made: Comparison, seen: AsFlown, run: StoredRun, flight: StoredFlight) -> Comparison:
@@ -60,7 +61,7 @@ def _reasons(plan: Plan, made: Comparison, flight: StoredFlight, apart: Mapping[
     if not data["segments"]:
         yield f"the flight came to no manoeuvre: {made.reason or 'it was broken off'}"
         return
-    moving = [one.partition(";")[0].replace(f": {_NOT_STILL}", "") for one in data["warnings"] if _NOT_STILL in one]
+    moving = [_NOT_STILL.sub("", one.partition(";")[0]) for one in data["warnings"] if _NOT_STILL.search(one)]
     if moving:
         yield f"it was not still when these began, and the batch begins from rest: {', '.join(moving)}"
     shake = {axis: _value(flight, f"{axis}_std_rad_s") for axis in "pqr"}

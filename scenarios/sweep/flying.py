@@ -23,6 +23,7 @@ def fly_best(
     path: Path,
     count: int,
     *,
+    source: Path | None = None,
     px4: Path | None = None,
     jobs: int = 0,
     command: Sequence[str] = (),
@@ -31,7 +32,8 @@ def fly_best(
     """Fly the best candidates in every case, and write down where batch and flights differ.
 
     Args:
-        path: of the sweep's folder. count: how many candidates. px4, jobs, command, tell: as `BestFlights`.
+        path: of the sweep's folder. count: how many candidates.
+        source: the sweep file; where it was read from without. px4, jobs, command, tell: as `BestFlights`.
 
     Returns:
         the comparison, for people.
@@ -42,7 +44,7 @@ def fly_best(
         FroudeError, KeyboardInterrupt: what stopped the flights; those before it are kept and compared.
     """
     dataset = Dataset(path)
-    plan = plan_of(dataset, same_program=False)
+    plan = plan_of(dataset, source, same_program=False)
     if dataset.facts().get("program") != program_facts()["program"]:
         tell(
             "the batch was flown by another version of the program than the flights are: that alone may set them apart"

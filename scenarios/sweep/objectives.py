@@ -47,7 +47,11 @@ def parse_objectives(file: KeyedTable, manoeuvres: Sequence[Manoeuvre], margins:
     if not texts:
         wanted = ["rise_time_s", "delay_margin_s", "overshoot_pct", "rms_error_deg", "lag_s", "rms_delta_lat"]
         texts = tuple([name for name in wanted if name in measured][:2])
-    return tuple(_objective(file, text, measured) for text in texts)
+    objectives = tuple(_objective(file, text, measured) for text in texts)
+    for k, one in enumerate(objectives):
+        if one in objectives[:k]:
+            raise file.error("objectives", f'"{texts[k]}" is named twice', "Name it once")
+    return objectives
 
 
 def _objective(file: KeyedTable, text: str, measured: Sequence[str]) -> Objective:

@@ -18,14 +18,13 @@ from functools import cached_property
 from typing import Any
 
 from scenarios.gain_set import GainSet, check
-from scenarios.roll_set import RollSet, roll_set
+from scenarios.roll_set import roll_set
 from scenarios.scenario import beside
 from scenarios.sweep.axes import ASSUMPTIONS, PROFILE, SCALING, VEHICLE
-from scenarios.sweep.sweep_file import GRID, SEARCH, Sweep, check_count
+from scenarios.sweep.sweep_file import GRID, SEARCH, Sweep, check_count, typed
 from sitl.errors import UsageError
 from sitl.parameters import ParameterTable
 from sitl.profile import Profile, get_profile
-from sitl.vehicle import airframe_parameters
 from sitl.vehicle_spec import DEFAULT_SCALING, VehicleModel, resolve_vehicle
 
 CHUNK_STEPS = 40_000_000
@@ -233,26 +232,21 @@ def _check_rate(sweep: Sweep, case: Case) -> None:
 def _check_values(sweep: Sweep, cases: Sequence[Case]) -> list[str]:
     """Both ends of every axis and the fixed parameters as a gain set is checked before it is uploaded."""
     warnings: list[str] = []
-    first = cases[0]
-    _checked(sweep, first, sweep.fixed, warnings)
+    table = ParameterTable()
+    warnings += check(GainSet("[parameters] and gains", sweep.fixed, path=sweep.path), table)
     for axis in sweep.parameters:
-        ends = [axis.low, axis.high]
-        for value in ends:
-            _checked(sweep, first, {axis.name: value}, warnings)
-        low, high = (_set(sweep, first, {**sweep.fixed, axis.name: value}) for value in ends)
-        if ends[0] != ends[1] and low.settings.tobytes() == high.settings.tobytes() and low.profile == high.profile:
+        ends = [typed({axis.name: value}) for value in (axis.low, axis.high)]
+        for end in ends:
+            warnings += check(GainSet("[axes]", end, path=sweep.path), table)
+        if axis.low != axis.high and not any(_acts(sweep, case, *ends) for case in cases):
             warnings.append(f"{axis.name} does not act on the roll axis: the batch cannot tell its values apart")
     return list(dict.fromkeys(warnings))
 
 
-def _set(sweep: Sweep, case: Case, values: Mapping[str, float]) -> RollSet:
+def _acts(sweep: Sweep, case: Case, low: Mapping[str, float], high: Mapping[str, float]) -> bool:
+    """Do two values of a parameter make two different loops?"""
     try:
-        return roll_set(case.model, case.profile, values)
+        one, other = (roll_set(case.model, case.profile, {**sweep.fixed, **end}) for end in (low, high))
     except UsageError as error:
         raise UsageError(f"{sweep.path}: axes: {error}") from error
-
-
-def _checked(sweep: Sweep, case: Case, values: Mapping[str, float], warnings: list[str]) -> None:
-    table = ParameterTable(airframe_parameters(case.model, case.profile))
-    typed = {name: int(v) if table.spec(name).type == "INT32" else v for name, v in values.items() if name in table}
-    warnings += check(GainSet(f"of {sweep.path.name}", typed, path=sweep.path), table)
+    return one.settings.tobytes() != other.settings.tobytes() or one.profile != other.profile

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from scenarios.analysis import SHOWN_MARGINS
+from scenarios.batch_flight import metrics_of
 from scenarios.gain_set import load_gain_sets
 from scenarios.limits import Limit
 from scenarios.manoeuvres import Manoeuvre, parse_manoeuvres
+from scenarios.metrics import LAST_S, SETTLE_S
 from scenarios.monte_carlo import MAX_SAMPLES
 from scenarios.scenario import beside, read_limits
 from scenarios.sweep.axes import ConditionAxis, ParameterAxis, parse_axes
@@ -53,7 +56,7 @@ class Sweep:
     Attributes:
         name: the file's name without suffix. title: one line for reports.
         parameters, conditions: axes. design: how candidates are chosen among the parameters' values.
-        fixed: PX4 parameters that every candidate has; an axis replaces what it varies.
+        fixed: PX4 parameters that every candidate has, INT32 as int; an axis replaces what it varies.
         manoeuvres, setpoint_rate_hz: flown by every sample. limits, limits_name: on each sample's metrics.
         margins: of the loop, worked out on every sample, on the nominal model alone, or not at all.
         required_pass_pct: of the samples, for a point to pass.
@@ -68,7 +71,7 @@ class Sweep:
     parameters: tuple[ParameterAxis, ...]
     conditions: tuple[ConditionAxis, ...]
     design: Design
-    fixed: Mapping[str, float]
+    fixed: Mapping[str, float | int]
     manoeuvres: tuple[Manoeuvre, ...]
     setpoint_rate_hz: float
     limits: tuple[Limit, ...]
@@ -108,13 +111,14 @@ def load_sweep(path: Path) -> Sweep:
     metrics = {limit.metric for limit in limits} & set(SHOWN_MARGINS)
     if margins == "none" and metrics:
         raise file.error("margins", f'"none", but {sorted(metrics)[0]} is limited', 'Write "samples" or "nominal"')
+    _check_measured(file, limits, manoeuvres)
     sweep = Sweep(
         name=path.stem,
         title=file.text("title", path.stem),
         parameters=parameters,
         conditions=conditions,
         design=design,
-        fixed=_fixed(file, path),
+        fixed=_fixed(file, path, [axis.name for axis in parameters]),
         manoeuvres=manoeuvres,
         setpoint_rate_hz=rate_hz,
         limits=limits,
@@ -140,6 +144,21 @@ def _margins_needed(limits: tuple[Limit, ...]) -> str:
     return "samples" if any(limit.metric in SHOWN_MARGINS for limit in limits) else "nominal"
 
 
+def _check_measured(file: KeyedTable, limits: tuple[Limit, ...], manoeuvres: tuple[Manoeuvre, ...]) -> None:
+    """A limit on what is never measured would fail every point."""
+    holds = [w.end_s - w.start_s for m in manoeuvres for w in m.windows if w.kind in ("step", "hold")]
+    need_s = LAST_S + SETTLE_S
+    if max(holds, default=0.0) < need_s - 1e-6:
+        problem = f"none holds a step for {need_s:g} s, and where no oscillation is measured no point can pass"
+        raise file.error("manoeuvre", problem, f'Add one of kind "step" with hold_s = {need_s:g} or more')
+    measured = (*metrics_of(manoeuvres), *SHOWN_MARGINS)
+    for limit in limits:
+        if limit.metric not in measured:
+            key = "limit" if "limit" in file else "limits"
+            problem = f"{limit.metric} is not measured by these manoeuvres"
+            raise file.error(key, problem, f"Add a manoeuvre that does, or limit one of {', '.join(measured)}")
+
+
 def _design(file: KeyedTable) -> Design:
     if "design" not in file:
         return Design(GRID, 0, 1, 0)
@@ -155,23 +174,39 @@ def _design(file: KeyedTable) -> Design:
     return design
 
 
-def _fixed(file: KeyedTable, path: Path) -> dict[str, float]:
-    """The gain set of `gains` and the table [parameters] on top of it."""
+def _fixed(file: KeyedTable, path: Path, varied: Collection[str]) -> dict[str, float | int]:
+    """The gain set of `gains` and the table [parameters] on top of it; an axis replaces what the gain set has."""
     fixed: dict[str, float] = {}
     if "gains" in file:
         sets = load_gain_sets(beside(path, file.text("gains")))
         if len(sets) != 1:
             names = ", ".join(one.name for one in sets)
             raise file.error("gains", f"names {len(sets)} gain sets", f"Name one of them: {names}")
-        fixed.update({name: float(value) for name, value in sets[0].parameters.items()})
+        fixed.update(sets[0].parameters)
+    specs = parameter_specs()
     if "parameters" in file:
         table = file.table("parameters")
         for name in table.keys:
-            if name not in parameter_specs():
-                problem = f"no such parameter{nearest(name, parameter_specs())}"
-                raise table.error(name, problem, "Correct or remove it")
-            fixed[name] = table.number(name)
-    return fixed
+            if name not in specs:
+                raise table.error(name, f"no such parameter{nearest(name, specs)}", "Correct or remove it")
+            if name in varied:
+                raise table.error(name, "it is an axis, too", "Leave it out of one of them")
+            value = table.number(name)
+            if specs[name].type == "INT32" and value != int(value):
+                raise table.error(name, f"{value:g}: PX4 keeps it as a whole number", "Write a whole number")
+            fixed[name] = value
+    return typed(fixed)
+
+
+def typed(values: Mapping[str, float]) -> dict[str, float | int]:
+    """Parameters with those that are INT32 as int: a value that is no whole number stays, and is refused when set.
+
+    Args:
+        values: PX4 name -> value.
+    """
+    specs = parameter_specs()
+    whole = {name for name, value in values.items() if name in specs and specs[name].type == "INT32"}
+    return {n: int(v) if n in whole and math.isfinite(v) and v == int(v) else float(v) for n, v in values.items()}
 
 
 def _choice(file: KeyedTable, key: str, known: tuple[str, ...], default: str) -> str:
