@@ -68,7 +68,8 @@ class Client:
         self.drive = drive
         self.connection = Connection(sysid, compid, datagram=link.datagram)
         if log is not None:
-            self.connection.on_frame = lambda frame: log(drive.now_us(), frame)
+            now_us = drive.now_us
+            self.connection.on_frame = lambda frame: log(now_us(), frame)
         self.state = VehicleState()
         self.target_system = 0
         self.target_component = 1

@@ -114,7 +114,10 @@ class Connection:
             frame += signer.signature(frame)
         self.sent += 1
         if self.on_frame is not None:
-            self._log(frame)
+            if flags or kind.id_bytes == _SETUP_SIGNING_ID:
+                self._log(frame)
+            else:
+                self.on_frame(frame)
         return frame
 
     def receive(self, data: bytes) -> list[Message]:
@@ -146,9 +149,15 @@ class Connection:
         return self._logged(self._splitter.flush())
 
     def _logged(self, messages: list[Message]) -> list[Message]:
-        if self.on_frame is not None:
+        log = self.on_frame
+        if log is not None:
             for message in messages:
-                self._log(message.raw_frame)
+                frame = message.raw_frame
+                # most frames are as they may be logged, and there are thousands a second
+                if frame[0] == MAGIC_2 and (frame[2] or frame[7:10] == _SETUP_SIGNING_ID):
+                    self._log(frame)
+                else:
+                    log(frame)
         return messages
 
     def _log(self, frame: bytes) -> None:

@@ -17,7 +17,7 @@ from sitl.errors import FileError
 SIMULATED_EPOCH_US = 1_577_836_800_000_000
 
 _STAMP = struct.Struct(">Q")
-_MOST_WAITING = 256
+_MOST_WAITING = 512
 
 
 class TlogWriter:
@@ -35,7 +35,8 @@ class TlogWriter:
         self.path = Path(path)
         self.epoch_us = epoch_us
         self._written = 0
-        self._waiting: list[bytes] = []
+        self._times_us: list[int] = []
+        self._frames: list[bytes] = []
         try:
             self._file = self.path.open("wb")
         except OSError as error:
@@ -48,21 +49,26 @@ class TlogWriter:
             time_us: when it passed, in microseconds from the epoch; never negative.
             frame: the whole frame.
         """
-        waiting = self._waiting
-        waiting.append(_STAMP.pack(self.epoch_us + time_us))
-        waiting.append(frame)
-        if len(waiting) >= _MOST_WAITING:
+        # stamped when it is written: this runs at every frame of a flight
+        self._times_us.append(time_us)
+        frames = self._frames
+        frames.append(frame)
+        if len(frames) >= _MOST_WAITING:
             self.flush()
 
     @property
     def frames(self) -> int:
         """Frames appended so far."""
-        return self._written + len(self._waiting) // 2
+        return self._written + len(self._frames)
 
     def flush(self) -> None:
         """Hand what waits to the operating system: from here on a killed process loses nothing of it."""
-        self._written += len(self._waiting) // 2
-        data, self._waiting = b"".join(self._waiting), []
+        times_us, frames = self._times_us, self._frames
+        self._times_us, self._frames = [], []
+        self._written += len(frames)
+        stamp, epoch_us = _STAMP.pack, self.epoch_us
+        stamps = [stamp(epoch_us + time_us) for time_us in times_us]
+        data = b"".join([part for pair in zip(stamps, frames, strict=True) for part in pair])
         try:
             self._file.write(data)
             self._file.flush()

@@ -9,7 +9,6 @@ torque that the motors produced, over the first tenth of a second of every stret
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -185,21 +184,22 @@ class RateTerms:
     def _work(self, rows: FloatArray, *, last: bool) -> TermRows:
         self._held = rows[:0]
         gaps = np.diff(rows[:, 0], prepend=self._last_s)
-        edges = np.unique([0, *np.flatnonzero(gaps > SLOWEST_S), len(rows)])
-        done = [np.zeros((0, len(TERMS)))]
-        for first, end in itertools.pairwise(edges):
-            new = bool(gaps[first] > SLOWEST_S)
-            if new and not last and end == len(rows) and end - first < ANCHOR_ROWS:
-                rows, self._held = rows[:first], rows[first:]
-                break
-            done.append(self._stretch(rows[first:end], gaps[first:end], new=new))
+        edges = np.unique(np.concatenate([[0], np.flatnonzero(gaps > SLOWEST_S), [len(rows)]]))
+        firsts, ends = edges[:-1], edges[1:]
+        new = gaps[firsts] > SLOWEST_S
+        if len(firsts) and new[-1] and not last and ends[-1] - firsts[-1] < ANCHOR_ROWS:
+            rows, self._held = rows[: firsts[-1]], rows[firsts[-1] :]
+            firsts, ends, new = firsts[:-1], ends[:-1], new[:-1]
+        done = np.full((len(rows), len(TERMS)), math.nan)
+        # where telemetry is slow every row stands alone, and nothing is known
+        known = ~new | (ends - firsts > 1)
+        for first, end, begins in zip(firsts[known], ends[known], new[known], strict=True):
+            done[first:end] = self._stretch(rows[first:end], gaps[first:end], new=bool(begins))
         if len(rows):
             self._last_s = float(rows[-1, 0])
-        return TermRows(rows[:, 0], np.concatenate(done))
+        return TermRows(rows[:, 0], done)
 
     def _stretch(self, rows: FloatArray, gaps: FloatArray, *, new: bool) -> FloatArray:
-        if new and len(rows) < 2:
-            return np.full((len(rows), len(TERMS)), math.nan)
         if new:
             # the truth begins to be streamed a row or two later than the attitude
             self._filters = bool(np.mean(rows[:ANCHOR_ROWS, -1]) > 0.5)

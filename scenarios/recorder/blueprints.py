@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -151,7 +152,9 @@ def series(
     )
 
 
+@lru_cache(maxsize=32)
 def _time_axis(page: Page | None) -> Any:
+    """Kept, because many plots of a page have the same, and it takes long to make."""
     import rerun as rr
     import rerun.blueprint as rrb
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -70,13 +71,7 @@ class BodyView:
         self._arrow_m = ARROW_DIAGONALS * diagonal
         grey = (150, 150, 150)
         recording.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-        edge = float(GROUND_M)
-        across = [[(-edge, float(y), 0.0), (edge, float(y), 0.0)] for y in range(-GROUND_M, GROUND_M + 1)]
-        along = [[(x, y, z) for y, x, z in line] for line in across]
-        recording.log(
-            "/world/ground",
-            rr.LineStrips3D([*across, *along], radii=-0.5, colors=[(70, 70, 70)]),
-        )
+        recording.log("/world/ground", _ground())
         recording.log(
             f"{BODY}/arms",
             rr.LineStrips3D([[(0.0, 0.0, 0.0), tuple(hub)] for hub in hubs], radii=0.02 * diagonal, colors=[grey]),
@@ -137,11 +132,22 @@ class BodyView:
         recording.columns(BODY, time_s, rr.Transform3D.columns(quaternion=quat[:, (1, 2, 3, 0)]))
         arrows = np.zeros((*motors.shape, 3))
         arrows[:, :, 2] = np.nan_to_num(motors) * self._arrow_m
-        thrust = rr.Arrows3D.columns(vectors=arrows.reshape(-1, 3)).partition([motors.shape[1]] * len(time_s))
+        thrust = rr.Arrows3D.columns(vectors=arrows.reshape(-1, 3)).partition(np.full(len(time_s), motors.shape[1]))
         recording.columns(f"{BODY}/thrust", time_s, thrust)
         self._corners.extend(enu_m[::PATH_STRIDE])
         path = rr.LineStrips3D([np.array(self._corners)], colors=[(86, 180, 233)], radii=[-1.5])
         recording.log("/world/path", path, float(time_s[0]))
+
+
+@cache
+def _ground() -> Any:
+    """The same for every flight."""
+    import rerun as rr
+
+    edge = float(GROUND_M)
+    across = [[(-edge, float(y), 0.0), (edge, float(y), 0.0)] for y in range(-GROUND_M, GROUND_M + 1)]
+    along = [[(x, y, z) for y, x, z in line] for line in across]
+    return rr.LineStrips3D([*across, *along], radii=-0.5, colors=[(70, 70, 70)])
 
 
 def rotor_radius(hubs: NDArray[np.float64], diagonal_m: float) -> float:

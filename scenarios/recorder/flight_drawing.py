@@ -79,6 +79,7 @@ class FlightDrawing:
         self._last_s = np.nan
         self._segments: list[Segment] = []
         self._shown: list[NDArray[np.float64]] = []
+        self._counted: list[tuple[float, LinkCounts]] = []
         # A first layout: the final one, which a file gets at its end, takes as long as seconds of flying.
         recording.layout(blueprints.flight_blueprint((), None) if live else blueprints.unfinished_blueprint())
         self._style()
@@ -92,6 +93,7 @@ class FlightDrawing:
                 `segment` is not used.
         """
         recording = self.recording
+        self._write_counted()
         time = np.asarray(rows["t_s"], dtype=np.float64)
         for plot in PLOTS:
             values = np.column_stack([rows[line.column] for line in plot.lines]).astype(np.float64)
@@ -123,11 +125,12 @@ class FlightDrawing:
         self._segments.append(segment)
 
     def link(self, t_s: float, counts: LinkCounts) -> None:
-        """What the link's counters say at a vehicle time, s."""
-        self.recording.lines("/link/messages", np.array([t_s]), np.array([counts.lines()], dtype=np.float64))
+        """What the link's counters say at a vehicle time, s; written with the next rows."""
+        self._counted.append((t_s, counts))
 
     def end_rows(self) -> None:
         """Write what waits for further rows, and the segments."""
+        self._write_counted()
         if self._terms is not None:
             self._write_terms(self._terms.finish())
         # A segment that begins where another ends takes its place.
@@ -174,6 +177,13 @@ class FlightDrawing:
                 [colour for _, colour, _ in TERM_LINES],
                 widths=[width for _, _, width in TERM_LINES],
             )
+
+    def _write_counted(self) -> None:
+        if self._counted:
+            times, counts = zip(*self._counted, strict=True)
+            self._counted = []
+            values = np.array([one.lines() for one in counts], dtype=np.float64)
+            self.recording.lines("/link/messages", np.array(times), values)
 
     def _write_terms(self, done: TermRows) -> None:
         if len(done.t_s):

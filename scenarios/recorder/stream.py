@@ -44,6 +44,8 @@ class Recording:
 
         rr.set_strict_mode(True)  # otherwise a wrong argument is a line on stderr and a hole in the file
         self.stream = stream
+        self._time_s: NDArray[np.float64] | None = None
+        self._time: Any = None
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
         stream.send_recording_name(name)
@@ -58,7 +60,10 @@ class Recording:
         """Send many rows of Rerun's component columns; time_s is (n,)."""
         import rerun as rr
 
-        self.stream.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=time_s)], columns)
+        if time_s is not self._time_s:
+            # many entities have the same rows
+            self._time_s, self._time = time_s, rr.TimeColumn(TIMELINE, duration=time_s)
+        self.stream.send_columns(entity, [self._time], columns)
 
     def style(
         self,
@@ -99,7 +104,7 @@ class Recording:
 
         scalars = rr.Scalars.columns(scalars=values.reshape(-1))
         if values.ndim == 2:
-            scalars = scalars.partition([values.shape[1]] * len(time_s))
+            scalars = scalars.partition(np.full(len(time_s), values.shape[1]))
         self.columns(entity, time_s, scalars)
 
     def lane(self, entity: str, time_s: float, state: str) -> None:
