@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from scenarios.sweep.flown_beside import flown_beside
-from scenarios.sweep.pareto import front_of
-from scenarios.sweep.ranking import rank
+from scenarios.run_folder import write_atomically
+from scenarios.sweep.flown_beside import FlownBeside, flown_beside
+from scenarios.sweep.pareto import Front, front_of
+from scenarios.sweep.ranking import Ranking, rank
 from scenarios.sweep.stored_sweep import stored_sweep
 from scenarios.sweep.sweep_object import sweep_object
 from scenarios.sweep.sweep_text import sweep_text
 from scenarios.sweep.winner import write_winner
+
+REPORT = "report.html"
 
 
 def show_sweep(
@@ -32,7 +35,31 @@ def show_sweep(
     """
     ranking = rank(stored_sweep(path))
     front, flown = front_of(ranking), flown_beside(path)
-    files = {file.name: str(file) for file in write_winner(ranking, path)}
+    made = [*write_winner(ranking, path), *_write_pictures(ranking, front, flown, path)]
+    files = {file.name: str(file) for file in made}
     if as_json:
         return ranking.passing, json.dumps(sweep_object(ranking, front, flown, files), indent=2) + "\n"
     return ranking.passing, sweep_text(ranking, front, flown, list(files), width=width, colour=colour)
+
+
+def _write_pictures(ranking: Ranking, front: Front, flown: FlownBeside | None, folder: Path) -> Sequence[Path]:
+    """Figures and page; pictures of an earlier look that are not drawn any more go."""
+    from scenarios.sweep.sweep_figures import heat_file, pareto_file
+    from scenarios.sweep.sweep_maps import heat_maps
+    from scenarios.sweep.sweep_report import sweep_page
+
+    maps = heat_maps(ranking) if len(ranking.order) else ()
+    written: list[Path] = []
+    figures = [pareto_file(ranking, front), *(heat_file(ranking, heat) for heat in maps)] if len(ranking.order) else []
+    for figure in figures:
+        for suffix, data in (("svg", figure.svg), ("png", figure.png)):
+            written.append(folder / f"{figure.name}.{suffix}")
+            write_atomically(written[-1], data)
+    for old in (*folder.glob("heat_*.???"), *folder.glob("pareto.???")):
+        if old not in written and old.suffix in (".svg", ".png"):
+            old.unlink(missing_ok=True)
+    report = folder / REPORT
+    pictures = [name for name in ("pareto.svg", "pareto.png") if folder / name in written]
+    pictures += ["heat_*.svg", "heat_*.png"] if maps else []
+    write_atomically(report, sweep_page(ranking, front, maps, flown, pictures).encode())
+    return [report, *written]

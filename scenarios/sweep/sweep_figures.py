@@ -46,7 +46,7 @@ _MOST_NUMBERS = 120
 _TICKS = 12
 _MOST_LETTERS = 32
 """Of all names below an axis, side by side."""
-SHARE_TITLE = "samples that pass in the worst case [%]"
+SHARE_TITLE = "models that pass in the worst case [%]"
 
 
 @dataclass(frozen=True)
@@ -111,12 +111,12 @@ def heat_drawing(ranking: Ranking, heat: HeatMap, kind: str, figure: str) -> Dra
     Args:
         ranking: of the sweep. heat: two of its parameters. kind: one of `kinds_of`. figure: its name on the page.
     """
-    width, height = 4.2, 3.3
-    panel = Panel(width, height, margins_in=(0.68, 0.62, 0.5, 0.1))
+    width, height = 4.3, 3.5
+    panel = Panel(width, height, margins_in=(0.68, 0.78, 0.74, 0.1))
     with panel.drawn() as (axes,):
         mesh, label = _draw_heat(axes, ranking, heat, kind, PAGE)
         box = axes.get_position()
-        place = panel.figure.add_axes((1 - 0.5 / width, box.y0, 0.14 / width, box.height))
+        place = panel.figure.add_axes((1 - 0.66 / width, box.y0, 0.14 / width, box.height))
         panel.figure.colorbar(mesh, cax=place)
         svg = panel.svg(figure)
     return Drawing(svg, _heat_told(ranking, heat, kind), label)
@@ -335,7 +335,7 @@ def _heat_told(ranking: Ranking, heat: HeatMap, kind: str) -> str:
         return f"Heat map over {names}: the best {objective_heading(one)} of what passes everywhere; {where}."
     what, values, unit = "cases passed", heat.passed, f"of {len(ranking.sweep.cases)}"
     if kind == SHARE:
-        what, values, unit = "share of the samples that pass in the worst case", heat.share_pct, "%"
+        what, values, unit = "share of the models that pass in the worst case", heat.share_pct, "%"
     known = values[np.isfinite(values)]
     span = f", from {known.min():.0f} to {known.max():.0f} {unit}" if len(known) else ""
     return f"Heat map over {names}: {what}, of the best candidate of each cell{span}; {where}."

@@ -21,6 +21,10 @@ MOST_CASES = 40
 REASONS = 5
 _FIXED_WIDTH = 4 + 6 + 6 + 21 + 5 + 5 * 2
 """Columns of a terminal that rank, number, cases passed, share and worst case take."""
+_END_SHARE = 0.02
+"""Of a range, what counts as its end."""
+_NARROW, _INTERVAL_WIDTH = 100, 14
+"""Of a terminal that has no room for intervals, and what they take."""
 _NAME_WIDTH, _VALUE_WIDTH = 8, 9
 _GAP = 2
 
@@ -92,6 +96,46 @@ def unfinished(ranking: Ranking) -> list[str]:
     return lines + [f"{problem}." for problem in ranking.problems]
 
 
+def doubts(ranking: Ranking, flown: FlownBeside | None) -> list[str]:
+    """What one should know before one trusts the result, a sentence each.
+
+    Args:
+        ranking: of a sweep. flown: what was flown of it; None: nothing.
+    """
+    lines = unfinished(ranking)
+    edges = at_the_end(ranking)
+    if edges:
+        lines.append(f"The best candidate lies at the end of {', '.join(edges)}: a better one may lie beyond.")
+    errors = sum(case.errors for case in ranking.cases)
+    if errors:
+        lines.append(f"{many(errors, 'point')} could not be judged; {many(len(ranking.failures), 'reason')} below.")
+    if flown is not None and flown.disagreements:
+        lines.append(
+            f"Batch and flight disagree about {len(flown.disagreements)} of {many(len(flown.flights), 'flight')}."
+        )
+    return lines
+
+
+def at_the_end(ranking: Ranking) -> list[str]:
+    """Axes at whose end the best candidate lies, with its value; the parameter's own least value is no end.
+
+    Args:
+        ranking: of a sweep.
+    """
+    best = ranking.best
+    if best is None:
+        return []
+    found = []
+    for axis in ranking.sweep.axes:
+        value = ranking.values_of(best)[axis.name]
+        # of a sampled range nothing lies on its very end
+        room = 0.0 if axis.values else _END_SHARE * (axis.high - axis.low)
+        zero = value - room <= 0.0 <= axis.low
+        if axis.low < axis.high and ((value <= axis.low + room and not zero) or value >= axis.high - room):
+            found.append(f"{axis.name} ({value:.5g})")
+    return found
+
+
 def most_failing(case: CaseSummary) -> str:
     """What breaks most samples of the points that fail; empty if none fails.
 
@@ -155,13 +199,17 @@ def sweep_text(
         tell(flown.headline)
         for line in flown.lines():
             tell(f"  {line}", "      ")
-    for line in unfinished(ranking):
-        console.print()
-        tell(line)
+    doubtful = doubts(ranking, flown)
+    if doubtful:
+        console.print("\nBefore you trust this:")
+        for line in doubtful:
+            tell(f"  {line}", "    ")
     console.print()
     console.print(f"Sweep folder: {ranking.sweep.path}", soft_wrap=True)
     if files:
-        tell(f"Written there: {', '.join(files)}")
+        drawn = sum(name.endswith(".png") for name in files)
+        named = [name for name in files if not name.endswith((".svg", ".png"))]
+        tell(f"Written there: {', '.join(named)}; {many(drawn, 'picture')} (pareto and heat maps, .svg and .png)")
     return "\n".join(line.rstrip() for line in sink.getvalue().splitlines()) + "\n"
 
 
@@ -196,11 +244,14 @@ def _candidates(ranking: Ranking, columns: int) -> tuple[Any, tuple[str, ...]]:
     sweep, cases = ranking.sweep, len(ranking.sweep.cases)
     names = tuple(influences(ranking))
     room = columns - _FIXED_WIDTH - sum(_width(objective_title(one)) + _GAP for one in sweep.objectives)
-    fitting = [k for k in range(len(names) + 1) if sum(_width(_broken(name)) + _GAP for name in names[:k]) <= room]
-    names, left_out = names[: max(1, fitting[-1])], names[max(1, fitting[-1]) :]
+    narrow = columns < _NARROW
+    room += _INTERVAL_WIDTH if narrow else 0
+    fitting = [k for k in range(1, len(names) + 1) if sum(_width(_broken(name)) + _GAP for name in names[:k]) <= room]
+    fits = max(fitting, default=1)
+    names, left_out = names[:fits], names[fits:]
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
     titles = ["rank", "candi-\ndate", *(_broken(axis.name) for axis in sweep.axes if axis.name in names)]
-    titles += ["cases\npassed", "worst case passes\n% (95 % interval)"]
+    titles += ["cases\npassed", "worst\ncase %" if narrow else "worst case passes\n% (95 % interval)"]
     titles += [objective_title(one).replace(" ", "\n") for one in sweep.objectives]
     for title in (*titles, "worst\ncase"):
         table.add_column(title, justify="right", no_wrap=True)
@@ -209,7 +260,8 @@ def _candidates(ranking: Ranking, columns: int) -> tuple[Any, tuple[str, ...]]:
         row = [Text(str(place)), Text(str(candidate))]
         row += [Text(f"{value:.4g}") for name, value in ranking.values_of(candidate).items() if name in names]
         row += [Text(f"{ranking.passed[candidate]}/{cases}", style=style)]
-        row += [Text(worst_text(ranking, candidate).replace(" %", ""))]
+        worst = worst_text(ranking, candidate).replace(" %", "")
+        row += [Text(worst.partition(" (")[0] if narrow else worst)]
         for k, one in enumerate(sweep.objectives):
             row.append(Text(shown_objective(one, ranking.objective(candidate, k), unit=False)))
         table.add_row(*row, Text(str(ranking.worst_case[candidate])))
