@@ -175,9 +175,9 @@ class Dask:
 
         try:
             columns: Columns = future.result(timeout=CONNECT_S)
-        except (FutureCancelledError, OSError, TimeoutError) as error:
+        except (FutureCancelledError, OSError, TimeoutError):
             raise LinkError(
-                f"{self._address}: the scheduler has gone: {error}. What is done is kept: go on with --resume"
+                f"{self._address}: the scheduler has gone. What is done is kept: go on with --resume"
             ) from None
         except ImportError as error:
             raise LinkError(

@@ -14,14 +14,18 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from itertools import count
 from multiprocessing import get_context, parent_process
-from typing import Protocol
+from typing import Any, Protocol
 
 from scenarios import interrupts
 from scenarios.sweep.evaluation import Columns, Evaluator, Task, failed
 from scenarios.sweep.plan import Plan
+from sitl.errors import UsageError
 
 _IN_HAND = 2
 """Chunks of a worker: one it works on, one that waits, so that it never does."""
+
+_MOST_STILLBORN = 10
+"""Workers that may die one after the other before one has finished a chunk."""
 
 DIED_TWICE = "its worker died twice while working it out: out of memory?"
 
@@ -31,7 +35,7 @@ class Result:
     """A chunk that is done.
 
     Attributes:
-        task: it. columns: its rows. lost: workers that died over it.
+        task: it. columns: its rows. lost: workers that have died since the result before.
     """
 
     task: Task
@@ -91,13 +95,14 @@ class InProcess:
 
 
 _evaluator: Rows | None = None
+_begun: Any = None
 
 
-def _begin(plan: Plan, make: Callable[[Plan], Rows]) -> None:
+def _begin(plan: Plan, make: Callable[[Plan], Rows], begun: Any) -> None:
     """A worker keeps its evaluator: samples and matrices of a case are made once."""
-    global _evaluator
+    global _evaluator, _begun
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    _evaluator = make(plan)
+    _evaluator, _begun = make(plan), begun
 
 
 def _end_with_parent() -> None:
@@ -110,18 +115,29 @@ def _end_with_parent() -> None:
 
 def _work(task: Task) -> Columns:
     assert _evaluator is not None
+    _begun.value = task.chunk.number
     return _evaluator.rows(task)
+
+
+class _Worker:
+    """A process, and the number of the chunk that it has begun last, in memory that outlives it."""
+
+    def __init__(self, plan: Plan, make: Callable[[Plan], Rows]) -> None:
+        # spawn: a forked child of a process that has started Arrow's threads may hang
+        context = get_context("spawn")
+        self.begun = context.RawValue("q", -1)
+        self.executor = ProcessPoolExecutor(1, context, initializer=_begin, initargs=(plan, make, self.begun))
 
 
 @dataclass(frozen=True)
 class _Given:
-    """A chunk that a worker has: order in which it was given out, to whom, workers that died over it before."""
+    """A chunk that a worker has: order in which it was given out, place of the worker, and how many it has killed."""
 
     order: int
-    worker: int
-    executor: ProcessPoolExecutor
+    place: int
+    worker: _Worker
     task: Task
-    lost: int
+    killed: int
 
 
 class Processes:
@@ -138,33 +154,38 @@ class Processes:
     def __init__(self, plan: Plan, workers: int = 0, make: Callable[[Plan], Rows] = Evaluator) -> None:
         self.workers = workers or os.cpu_count() or 1
         self._plan, self._make = plan, make
-        self._executors: list[ProcessPoolExecutor] = []
+        self._places: list[_Worker] = []
         self._running: dict[Future[Columns], _Given] = {}
         self._again: list[tuple[Task, int]] = []
+        self._lost = self._stillborn = 0
 
     def __enter__(self) -> Processes:
-        self._executors = [self._executor() for _ in range(self.workers)]
+        self._places = [_Worker(self._plan, self._make) for _ in range(self.workers)]
         return self
 
     def __exit__(self, *_: object) -> None:
-        for executor in self._executors:
+        for worker in self._places:
             # nobody waits for a chunk that nobody will read
-            for process in list((executor._processes or {}).values()):
+            for process in list((worker.executor._processes or {}).values()):
                 process.kill()
-            executor.shutdown(wait=True, cancel_futures=True)
-        self._executors = []
+            worker.executor.shutdown(wait=True, cancel_futures=True)
+        self._places = []
 
-    def _executor(self) -> ProcessPoolExecutor:
-        # spawn: a forked child of a process that has started Arrow's threads may hang
-        return ProcessPoolExecutor(1, get_context("spawn"), initializer=_begin, initargs=(self._plan, self._make))
+    def pids(self) -> list[int]:
+        """Of the workers that have started."""
+        return [pid for worker in self._places for pid in list(worker.executor._processes or {})]
 
     def run(self, tasks: Iterable[Task]) -> Iterator[Result]:
-        """Results as they come: each worker has one chunk in hand and one waiting."""
+        """Results as they come: each worker has one chunk in hand and one waiting.
+
+        Raises:
+            UsageError: no worker lives long enough to begin a chunk.
+        """
         source, orders = iter(tasks), count()
         self._running.clear()
         self._again.clear()
-        for worker in range(self.workers):
-            self._fill(worker, source, orders)
+        for place in range(self.workers):
+            self._fill(place, source, orders)
         while self._running:
             done, _ = wait(self._running, return_when=FIRST_COMPLETED)
             for future in sorted(done & self._running.keys(), key=lambda one: self._running[one].order):
@@ -172,38 +193,61 @@ class Processes:
                 if given is None:
                     continue  # went with its worker, a moment ago
                 try:
-                    yield Result(given.task, future.result(), given.lost)
+                    columns = future.result()
                 except BrokenProcessPool:
                     yield from self._replace(given)
-                self._fill(given.worker, source, orders)
+                else:
+                    self._stillborn = 0
+                    yield self._result(given.task, columns)
+                self._fill(given.place, source, orders)
 
-    def _fill(self, worker: int, source: Iterator[Task], orders: Iterator[int]) -> None:
-        while sum(1 for given in self._running.values() if given.worker == worker) < _IN_HAND:
-            task, lost = self._again.pop() if self._again else (next(source, None), 0)
+    def _result(self, task: Task, columns: Columns) -> Result:
+        lost, self._lost = self._lost, 0
+        return Result(task, columns, lost)
+
+    def _fill(self, place: int, source: Iterator[Task], orders: Iterator[int]) -> None:
+        while sum(1 for given in self._running.values() if given.place == place) < _IN_HAND:
+            task, killed = self._again.pop() if self._again else (next(source, None), 0)
             if task is None:
                 return
+            worker = self._places[place]
             try:
                 with interrupts.kept_from_children():
-                    future = self._executors[worker].submit(_work, task)
+                    future = worker.executor.submit(_work, task)
             except BrokenProcessPool:
                 # it died with nothing to do, or what it had is told of in a moment
-                self._executors[worker] = self._executor()
-                self._again.append((task, lost))
+                self._renew(place)
+                self._again.append((task, killed))
                 continue
-            self._running[future] = _Given(next(orders), worker, self._executors[worker], task, lost)
+            self._running[future] = _Given(next(orders), place, worker, task, killed)
+
+    def _renew(self, place: int) -> None:
+        self._lost += 1
+        self._stillborn += 1
+        if self._stillborn > _MOST_STILLBORN:
+            raise UsageError(
+                f"{self._stillborn} workers, one after the other, died without finishing a chunk: out of memory? Give "
+                "fewer with --jobs, and go on with --resume"
+            )
+        self._places[place].executor.shutdown(wait=True, cancel_futures=True)
+        self._places[place] = _Worker(self._plan, self._make)
 
     def _replace(self, first: _Given) -> Iterator[Result]:
         """A worker has died: a new one takes its place, and what the old one had is given out again.
 
-        Its executor breaks everything that it had been given. The first was in hand; what waited has done no harm.
+        Its executor breaks everything that it had been given. What it had begun is to blame; what waited has done no
+        harm.
         """
-        for future in [one for one, given in self._running.items() if given.executor is first.executor]:
-            given = self._running.pop(future)
-            self._again.append((given.task, given.lost))
-        if self._executors[first.worker] is first.executor:
-            self._executors[first.worker] = self._executor()
-        first.executor.shutdown(wait=True, cancel_futures=True)
-        if first.lost:
-            yield Result(first.task, failed(self._plan, len(first.task.values), DIED_TWICE), first.lost + 1)
-        else:
-            self._again.append((first.task, 1))
+        others = [one for one, given in self._running.items() if given.worker is first.worker]
+        given_up = []
+        for given in (first, *(self._running.pop(future) for future in others)):
+            killed = given.killed + (given.task.chunk.number == first.worker.begun.value)
+            if killed < 2:
+                self._again.append((given.task, killed))
+            else:
+                given_up.append(given.task)
+        if self._places[first.place] is first.worker:
+            self._renew(first.place)
+        for task in given_up:
+            self._stillborn = 0
+            yield self._result(task, failed(self._plan, len(task.values), DIED_TWICE))
