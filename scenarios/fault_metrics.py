@@ -1,13 +1,13 @@
 """What a fault did to the flight: how far roll was pushed away, how long it took to be back, how much height it cost.
 
-Roll is measured where its set-point stands still, that is in steps and holds, from the fault's begin to the end of that
-segment: against the error that roll had when the fault began, so that the droop of a long hold is not taken for the
-fault's doing.
+Roll is measured where its set-point stands still and has stood for a second, that is in steps and holds, from the
+fault's begin to the end of that segment: against where roll was when the fault began, so that the droop of a long hold is
+not taken for the fault's doing. Where the set-point moves, the metrics of step and track tell.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from scenarios.telemetry import Telemetry
 NAMES = ("fault_roll_deviation_deg", "fault_recovery_s", "fault_height_loss_m")
 
 CALM_S = 1.0
-"""A set-point must have stood for so long before the fault: else the step is in the deviation."""
+"""The set-point must have stood for so long before the fault, or the step would be in the deviation."""
 
 BEFORE_S = 0.1
 """The error before the fault is the mean over so long."""
@@ -38,53 +38,49 @@ def fault_metrics(telemetry: Telemetry, segments: Sequence[Segment], faults: Seq
     """
     found: list[Metric] = []
     for segment in segments:
-        of_one = [
-            _measured(telemetry, segment, fault.start_s)
-            for fault in faults
-            if fault.start_s is not None and segment.start_s - 1e-6 <= fault.start_s < segment.end_s - 1e-6
-        ]
-        for metrics in zip(*of_one, strict=True):
+        of_one: dict[str, list[Metric]] = {}
+        for fault in faults:
+            start_s = fault.start_s
+            if start_s is not None and segment.start_s - 1e-6 <= start_s < segment.end_s - 1e-6:
+                for metric in _measured(telemetry, segment, start_s):
+                    of_one.setdefault(metric.name, []).append(metric)
+        for metrics in of_one.values():
             unset = [one for one in metrics if one.value is None]
             found.append(unset[0] if unset else max(metrics, key=lambda one: one.value or 0.0))
     return found
 
 
-def no_segment(faults: Sequence[InjectedFault]) -> list[Metric]:
-    """The metrics of a flight whose faults all began outside of what is measured, with the reason.
+def not_measured(faults: Sequence[InjectedFault], measured_ones: Collection[str]) -> list[Metric]:
+    """The metrics that no fault of a flight could be measured by, with the reason.
 
     Args:
-        faults: of the flight.
+        faults: of the flight. measured_ones: names of those that it could.
     """
     began = any(fault.start_s is not None for fault in faults)
-    reason = "every fault began between two manoeuvres" if began else "no fault was injected"
-    return [measured(name, None, reason) for name in NAMES]
+    reason = (
+        "no fault began where the roll set-point had stood still for a second" if began else "no fault was injected"
+    )
+    return [measured(name, None, reason) for name in NAMES if name not in measured_ones]
 
 
-def _measured(telemetry: Telemetry, segment: Segment, start_s: float) -> tuple[Metric, Metric, Metric]:
+def _measured(telemetry: Telemetry, segment: Segment, start_s: float) -> list[Metric]:
+    """Height always, roll only where nothing else moves it."""
     t_s = telemetry["t_s"]
     first, last = np.searchsorted(t_s, [start_s - 1e-6, segment.end_s - 1e-6])
     rows = slice(int(first), int(last))
     t, down = t_s[rows], telemetry["down_m"][rows].astype(np.float64)
-    name = segment.name
+    calm = segment.kind != "track" and start_s - segment.start_s >= CALM_S - 1e-6
     hole = _hole(t, start_s, segment.end_s)
     if hole:
-        none = tuple(measured(one, None, hole, name) for one in NAMES)
-        return none[0], none[1], none[2]
-    height = measured(NAMES[2], max(0.0, float(np.max(down - down[0]))), "", name)
-    stood_s = start_s - segment.start_s
-    if segment.kind == "track":
-        reason = "the set-point moves: see rms_error_deg"
-    elif stood_s < CALM_S - 1e-6:
-        reason = f"the set-point stepped {stood_s:.2g} s before the fault: {CALM_S:g} s are needed"
-    else:
-        reason = ""
-    if reason:
-        return measured(NAMES[0], None, reason, name), measured(NAMES[1], None, reason, name), height
+        return [measured(name, None, hole, segment.name) for name in (NAMES if calm else NAMES[2:])]
+    height = measured(NAMES[2], max(0.0, float(np.max(down - down[0]))), "", segment.name)
+    if not calm:
+        return [height]
     earlier = int(np.searchsorted(t_s, start_s - BEFORE_S - 1e-6))
     phi = np.unwrap(telemetry["phi_rad"][earlier : rows.stop].astype(np.float64))
     before = int(first) - earlier
     moved = np.degrees(phi[before:] - (float(np.mean(phi[:before])) if before else phi[0]))
-    return (*_roll(t - start_s, moved, name), height)
+    return [*_roll(t - start_s, moved, segment.name), height]
 
 
 def _roll(t: FloatArray, moved_deg: FloatArray, segment: str) -> tuple[Metric, Metric]:

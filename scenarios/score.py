@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from scenarios.fault_metrics import fault_metrics, no_segment
+from scenarios.fault_metrics import fault_metrics, not_measured
 from scenarios.flight import Segment
 from scenarios.injected_fault import InjectedFault
 from scenarios.limits import METRICS, Metric, Outcome, measured
@@ -68,7 +68,7 @@ def flight_metrics(
     for name, shake in shakes.items():
         of_segments += _shake_metrics([shake], name)
     whole += margin_metrics(margins) if margins else []
-    whole += no_segment(faults) if faults and not of_faults else []
+    whole += not_measured(faults, {metric.name for metric in of_faults}) if faults else []
     whole += _estimate_metrics(telemetry, segments)
     whole += _data_metrics(telemetry, segments)
     order = {name: place for place, name in enumerate(METRICS)}

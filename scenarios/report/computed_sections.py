@@ -179,7 +179,8 @@ def samples_section(sets: Sets, found: Found, model: VehicleModel | None) -> Sec
         return Section("uncertain", "Uncertain models", [f"Not computed: {why}."])
     lead = [
         f"{SAMPLES} random models within 3 sigma of the identified one (seed {SEED}), the same for every gain set, "
-        "each flying the run's own manoeuvres on the roll axis alone, without noise. Histograms share an axis; upright "
+        f"each flying the run's own manoeuvres on the roll axis alone, without noise{_no_faults(sets)}. "
+        "Histograms share an axis; upright "
         "line: median; diamond: the nominal model; dashed: the limit. The tables hold what was flown beside them."
     ]
     entries = tuple(Entry(one.name, one.style, samples) for one, samples in some)
@@ -194,6 +195,10 @@ def samples_section(sets: Sets, found: Found, model: VehicleModel | None) -> Sec
     notes = [f"Limits that only a flight can tell are left out here: {', '.join(unsampled)}"] if unsampled else []
     notes += [f"{one.name}: {found[one.number].problem}" for one, samples in known if samples is None]
     return Section("uncertain", "Uncertain models", lead, (), figures, notes=notes)
+
+
+def _no_faults(sets: Sets) -> str:
+    return " and without the scenario's faults" if sets.run.data["scenario"]["faults"] else ""
 
 
 def bounds_of(data: Mapping[str, Any]) -> dict[str, Bounds]:
