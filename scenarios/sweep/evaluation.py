@@ -268,11 +268,9 @@ def _holds(limit: Limit, value: FloatArray) -> npt.NDArray[np.bool_]:
 def _spread(name: str, value: FloatArray, drawn: slice) -> Columns:
     """The columns of `scenarios.analysis.Spread`, of every row of (G, S); S is 1 where only the nominal is known."""
     rows = value[:, drawn] if value.shape[1] > 1 else value
-    ordered = np.sort(rows, axis=1)  # NaN last
+    ordered = rows = np.sort(rows, axis=1)  # NaN last
     if name == "droop_deg":
-        rows = np.take_along_axis(rows, np.argsort(np.abs(rows), axis=1, kind="stable"), axis=1)
-    else:
-        rows = ordered
+        rows = np.take_along_axis(ordered, np.argsort(np.abs(ordered), axis=1, kind="stable"), axis=1)
     known = rows.shape[1] - np.isnan(rows).sum(axis=1)
     at, last = np.arange(len(rows)), np.maximum(known - 1, 0)
     first, final = rows[:, 0], rows[at, last]
