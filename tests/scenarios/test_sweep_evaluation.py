@@ -219,7 +219,7 @@ class TestAgainstTheOracle:
         task = task_of(plan, 0)
         rows = Evaluator(plan).rows(task)
         drawn = draw_samples(case.model, 12, 3)
-        omega = np.geomspace(0.02, 600.0, 1500)
+        omega = np.geomspace(0.05, 0.9999 * math.pi * case.profile.rate_hz, 800)
         some = 0
         for g, values in enumerate(task.values):
             k_phi, kp = values.tolist()
