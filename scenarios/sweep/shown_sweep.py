@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from scenarios.run_folder import write_atomically
 from scenarios.sweep.flown_beside import FlownBeside, flown_beside
@@ -15,7 +16,11 @@ from scenarios.sweep.sweep_object import sweep_object
 from scenarios.sweep.sweep_text import sweep_text
 from scenarios.sweep.winner import write_winner
 
+if TYPE_CHECKING:
+    from scenarios.sweep.sweep_figures import FigureFile
+
 REPORT = "report.html"
+RECORDING = "sweep.rrd"
 
 
 def show_sweep(
@@ -62,4 +67,15 @@ def _write_pictures(ranking: Ranking, front: Front, flown: FlownBeside | None, f
     pictures = [name for name in ("pareto.svg", "pareto.png") if folder / name in written]
     pictures += ["heat_*.svg", "heat_*.png"] if maps else []
     write_atomically(report, sweep_page(ranking, front, maps, flown, pictures).encode())
-    return [report, *written]
+    return [report, *_recorded(ranking, front, figures, folder), *written]
+
+
+def _recorded(ranking: Ranking, front: Front, figures: Sequence[FigureFile], folder: Path) -> Sequence[Path]:
+    recording = folder / RECORDING
+    if not figures:
+        recording.unlink(missing_ok=True)
+        return []
+    from scenarios.recorder.sweep_recording import record_sweep
+
+    heats = {figure.name.removeprefix("heat_"): figure.png for figure in figures[1:]}
+    return [record_sweep(ranking, front, heats, recording)]

@@ -137,8 +137,12 @@ def _verdict(ranking: Ranking) -> str:
 # -- the front -------------------------------------------------------------------------------------------------------
 
 
-def _axis(ranking: Ranking, number: int) -> FloatArray:
-    """(N,) of an axis as people read it: an objective, or behind the only one the share that passes."""
+def axis_values(ranking: Ranking, number: int) -> FloatArray:
+    """(N,) of an axis as people read it: an objective, or behind the only one the share that passes.
+
+    Args:
+        ranking: of the sweep. number: 0 across, 1 up.
+    """
     objectives = ranking.sweep.objectives
     if number < len(objectives):
         one = objectives[number]
@@ -153,10 +157,32 @@ def _axis_title(ranking: Ranking, number: int) -> str:
     return SHARE_TITLE
 
 
+def drawable_of(ranking: Ranking) -> npt.NDArray[np.bool_]:
+    """(N,) candidates that are complete and have finite values on both axes.
+
+    Args:
+        ranking: of the sweep.
+    """
+    return np.asarray(ranking.complete & np.isfinite(axis_values(ranking, 0)) & np.isfinite(axis_values(ranking, 1)))
+
+
+def candidate_ends(ranking: Ranking, front: Front) -> tuple[Ends, Ends]:
+    """Ends of both axes: what passes everywhere is seen, or the front where nothing does.
+
+    Args:
+        ranking, front: of the sweep.
+    """
+    drawable = drawable_of(ranking)
+    keep = np.flatnonzero(ranking.everywhere & drawable)
+    keep = keep if len(keep) else front.candidates[drawable[front.candidates]]
+    x, y = axis_values(ranking, 0), axis_values(ranking, 1)
+    return ends_of(x, drawable, x[keep]), ends_of(y, drawable, y[keep])
+
+
 def _draw_pareto(axes: Any, ranking: Ranking, front: Front, ink: Mapping[str, str]) -> str:
     """Draw, and say what is drawn."""
-    x, y = _axis(ranking, 0), _axis(ranking, 1)
-    drawable = ranking.complete & np.isfinite(x) & np.isfinite(y)
+    x, y = axis_values(ranking, 0), axis_values(ranking, 1)
+    drawable = drawable_of(ranking)
     kinds = [
         (
             "fails somewhere",
@@ -198,12 +224,12 @@ def _draw_pareto(axes: Any, ranking: Ranking, front: Front, ink: Mapping[str, st
             "zorder": 4,
         }
         axes.scatter(x[best], y[best], label=label, **star)
-    keep = np.flatnonzero(ranking.everywhere & drawable)
-    keep = on if not len(keep) else keep
-    inside = drawable & _scale(axes.xaxis, axes.set_xlim, x, drawable, x[keep])
-    inside &= _scale(axes.yaxis, axes.set_ylim, y, drawable, y[keep])
-    axes.set_xlabel(_label(ranking, 0))
-    axes.set_ylabel(_label(ranking, 1))
+    x_ends, y_ends = candidate_ends(ranking, front)
+    inside = drawable & x_ends.within(x) & y_ends.within(y)
+    _scale(axes.xaxis, axes.set_xlim, x_ends)
+    _scale(axes.yaxis, axes.set_ylim, y_ends)
+    axes.set_xlabel(axis_label(ranking, 0))
+    axes.set_ylabel(axis_label(ranking, 1))
     if drawable.any():
         place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.1}
         axes.legend(ncols=4, frameon=False, fontsize=SMALL, handletextpad=0.4, columnspacing=1.2, **place)
@@ -216,36 +242,63 @@ def _draw_pareto(axes: Any, ranking: Ranking, front: Front, ink: Mapping[str, st
     return "; ".join(told) + "."
 
 
-def _label(ranking: Ranking, number: int) -> str:
+def axis_label(ranking: Ranking, number: int) -> str:
+    """What is along an axis, and which way is good.
+
+    Args:
+        ranking: of the sweep. number: 0 across, 1 up.
+    """
     objectives = ranking.sweep.objectives
     large = number >= len(objectives) or objectives[number].maximise
     return f"{_axis_title(ranking, number)}, {'large' if large else 'small'} is good"
 
 
-def _scale(axis: Any, limits: Any, every: FloatArray, drawable: npt.NDArray[np.bool_], keep: FloatArray) -> Any:
-    """Set the ends of an axis, and tell what lies within, (N,).
+@dataclass(frozen=True)
+class Ends:
+    """Of an axis.
+
+    Attributes:
+        low, high: what it shows, in its unit. log: it is logarithmic.
+    """
+
+    low: float
+    high: float
+    log: bool
+
+    def within(self, values: FloatArray) -> npt.NDArray[np.bool_]:
+        """Which of them it shows."""
+        return np.asarray((values >= self.low) & (values <= self.high))
+
+
+def ends_of(every: FloatArray, drawable: npt.NDArray[np.bool_], keep: FloatArray) -> Ends:
+    """What an axis shows.
 
     All that is to be kept is, and of the rest what lies about it: a candidate that hardly moves has a rise time that
     would press all others into a corner. A logarithm where they span much.
+
+    Args:
+        every: (N,) values of all candidates. drawable: (N,) which have one. keep: values that must be seen.
     """
     values = every[drawable]
     if not len(values):
-        return drawable
+        return Ends(0.0, 1.0, False)
     low, high = (float(end) for end in np.percentile(values, [1.0, 97.0]))
     if len(keep):
         span = _AROUND * float(np.ptp(keep)) or high - low
-        low, high = max(low, keep.min() - span), min(high, keep.max() + span)
-        low, high = min(low, keep.min()), max(high, keep.max())
+        low, high = max(low, float(keep.min()) - span), min(high, float(keep.max()) + span)
+        low, high = min(low, float(keep.min())), max(high, float(keep.max()))
     if values.min() > 0.0 and high / low > _LOG_SPAN:
+        room = (high / low) ** 0.05
+        return Ends(low / room, high * room, True)
+    room = 0.06 * (high - low) or 0.05 * abs(high) or 1.0
+    return Ends(low - room, high + room, False)
+
+
+def _scale(axis: Any, limits: Any, ends: Ends) -> None:
+    if ends.log:
         axis._set_axes_scale("log")
         _log_ticks(axis)
-        room = (high / low) ** 0.05
-        low, high = low / room, high * room
-    else:
-        room = 0.06 * (high - low) or 0.05 * abs(high) or 1.0
-        low, high = low - room, high + room
-    limits(low, high)
-    return (every >= low) & (every <= high)
+    limits(ends.low, ends.high)
 
 
 def _log_ticks(axis: Any) -> None:
