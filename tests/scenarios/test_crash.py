@@ -227,11 +227,13 @@ class TestOverUdp:
 
     def test_a_vehicle_that_starts_anew_in_flight(self, serve: Any, quick: Path, tmp_path: Path) -> None:
         port = free_port()
-        vehicle = serve(port)
+        vehicle, anew = serve(port), serve(port)
+        # It waits: on a slow computer a vehicle needs longer to start than anybody waits for its next message.
+        anew.send_signal(signal.SIGSTOP)
         process = froude("fly", quick, "--connect", f"udpin://127.0.0.1:{port}", "--out", tmp_path / "runs")
         folder = in_flight(tmp_path / "runs")
         vehicle.kill()
-        serve(port)
+        anew.send_signal(signal.SIGCONT)
         status, _, (line,) = ended(process)
         assert status == 3
         assert "so it has restarted" in line
