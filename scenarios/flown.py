@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from scenarios.flight import FlightRecord
+
+Landed = Callable[[int, FlightRecord], object]
+"""Called with the number and the record of each flight that is over."""
 
 
 @dataclass(frozen=True)

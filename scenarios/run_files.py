@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from scenarios.flight import RunRecord
+from scenarios.flight import FlightRecord, RunRecord
 from scenarios.flight_job import FlightJob
-from scenarios.run_folder import RunFolder, run_object
+from scenarios.run_folder import RunFolder, flight_object, run_object
 
 if TYPE_CHECKING:
     from scenarios.report.drafting import ReportDraft
@@ -31,6 +31,17 @@ def report_draft(known: RunRecord, jobs: Sequence[FlightJob], candidates: int) -
         for number, job in enumerate(jobs)
     ]
     return ReportDraft(run_object(known), sets)
+
+
+def tell_landed(draft: ReportDraft | None, folder: RunFolder | None, number: int, record: FlightRecord) -> None:
+    """Tell the report of a flight that is over.
+
+    Args:
+        draft: of the report; None for no report. folder: of the run. number: in the order of the run.
+        record: of the flight.
+    """
+    if draft is not None and folder is not None and len(record.telemetry):
+        draft.landed(number, flight_object(record), folder.flight_file(record.gain_set.slug, ".parquet"))
 
 
 def write_run(

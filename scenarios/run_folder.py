@@ -138,7 +138,7 @@ def run_object(run: RunRecord, folder: RunFolder | None = None, command: Sequenc
     """
     scenario = run.scenario
     own = own_flight(run)
-    flights = [_flight_object(flight, folder) for flight in run.flights]
+    flights = [flight_object(flight, folder) for flight in run.flights]
     return {
         "schema_version": SCHEMA_VERSION,
         "complete": run.complete,
@@ -182,7 +182,7 @@ def run_object(run: RunRecord, folder: RunFolder | None = None, command: Sequenc
         "flown": len(run.flights),
         "passed": sum(flight.outcome is Outcome.PASS for flight in run.flights),
         "flights": flights,
-        "baseline": None if run.baseline is None else _flight_object(run.baseline, folder),
+        "baseline": None if run.baseline is None else flight_object(run.baseline, folder),
         "twins": [_twin_object(twin, folder) for twin in run.twins],
     }
 
@@ -209,11 +209,16 @@ def _twin_object(twin: Twin, folder: RunFolder | None) -> dict[str, Any]:
             }
             for one in difference.quantities
         ],
-        "own": _flight_object(twin.own, folder, OWN_SUFFIX),
+        "own": flight_object(twin.own, folder, OWN_SUFFIX),
     }
 
 
-def _flight_object(flight: FlightRecord, folder: RunFolder | None, suffix: str = "") -> dict[str, Any]:
+def flight_object(flight: FlightRecord, folder: RunFolder | None = None, suffix: str = "") -> dict[str, Any]:
+    """A flight as `run.json` holds it.
+
+    Args:
+        flight: its record. folder: where its files are; None leaves them out. suffix: of the files' names.
+    """
     gain_set = flight.gain_set
     return {
         "gain_set": {

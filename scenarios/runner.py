@@ -16,12 +16,12 @@ from bridge.clock import utc_stamp
 from scenarios import interrupts
 from scenarios.faults import check_faults
 from scenarios.flight import FlightRecord, RunRecord
-from scenarios.flown import Flown, Progress
+from scenarios.flown import Flown, Landed, Progress
 from scenarios.gain_set import GainSet, check, flies_gains, flight_gain_parameters, load_all
 from scenarios.hil_session import geometry_parameters
 from scenarios.limits import Outcome
 from scenarios.one_flight import MEMORY, FlightJob, FlightStoppedError, fly
-from scenarios.run_files import report_draft, write_run
+from scenarios.run_files import report_draft, tell_landed, write_run
 from scenarios.run_folder import RunFolder, vehicle_description
 from scenarios.scenario import Scenario
 from scenarios.versions import versions
@@ -194,7 +194,7 @@ def _run_scenario(
     if options.is_hil:
         flown, twins = _fly_real(jobs, planned, options, progress)
     else:
-        flown = _fly_all(jobs, options.jobs, progress, options.say)
+        flown = _fly_all(jobs, options.jobs, progress, options.say, lambda *one: tell_landed(draft, folder, *one))
     records, stopped = flown.records, flown.stopped
     if stopped is not None:
         records = {index: record for index, record in records.items() if len(record.telemetry)}
@@ -329,9 +329,10 @@ def _fly_all(
     workers: int,
     progress: Callable[[Progress], object],
     say: Callable[[str], object],
+    landed: Landed,
 ) -> Flown:
     if workers > 1 and len(jobs) > 1:
-        return _fly_side_by_side(jobs, workers, progress)
+        return _fly_side_by_side(jobs, workers, progress, landed)
     flown = Flown()
     for index, job in enumerate(jobs):
         name = job.gain_set.name
@@ -341,6 +342,7 @@ def _fly_all(
                 lambda phase, i=index, n=name: progress(Progress(i, len(jobs), n, phase)),  # type: ignore[misc]
                 say=say,
             )
+            landed(index, flown.records[index])
         except FlightStoppedError as stop:
             flown.records[index] = stop.record
             flown.stopped, flown.owed = stop.cause, stop.owed
@@ -351,7 +353,9 @@ def _fly_all(
     return flown
 
 
-def _fly_side_by_side(jobs: Sequence[FlightJob], workers: int, progress: Callable[[Progress], object]) -> Flown:
+def _fly_side_by_side(
+    jobs: Sequence[FlightJob], workers: int, progress: Callable[[Progress], object], landed: Landed
+) -> Flown:
     """In processes of their own; when something stops the run, flights that have begun are flown to their end."""
     flown = Flown()
     # spawn: a forked child of a process that has started Arrow's or Rerun's threads may hang
@@ -365,6 +369,7 @@ def _fly_side_by_side(jobs: Sequence[FlightJob], workers: int, progress: Callabl
             _collect(done, flights[done], flown)
             if flown.stopped is not None:
                 break
+            landed(flights[done], flown.records[flights[done]])
             progress(Progress(number, len(jobs), jobs[flights[done]].gain_set.name, "done"))
     except KeyboardInterrupt as stop:
         flown.stopped = stop

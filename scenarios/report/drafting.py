@@ -7,13 +7,15 @@ no time at all. A report that fails never loses the run.
 from __future__ import annotations
 
 import json
+import queue
 import subprocess
 import sys
+import threading
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import IO, Any, Self
 
 from sitl.errors import FileError
 
@@ -32,13 +34,15 @@ class ReportDraft:
     def __init__(self, data: Mapping[str, Any], sets: Iterable[Mapping[str, Any]]) -> None:
         self._known = json.dumps({"data": data, "sets": list(sets)})
         self._process: subprocess.Popen[str] | None = None
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._sending: threading.Thread | None = None
         self._folder = Path()
 
     def __enter__(self) -> Self:
         command = [sys.executable, "-P", "-m", "scenarios.report.helper"]
         with suppress(OSError, ValueError):
             # in a session of its own it does not hear Ctrl-C: the run decides what becomes of it
-            self._process = subprocess.Popen(
+            process = subprocess.Popen(
                 command,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
@@ -47,13 +51,26 @@ class ReportDraft:
                 encoding="utf-8",
                 start_new_session=True,
             )
-            self._send(self._known)
+            # who flies never waits for a helper that has no time to read
+            self._sending = threading.Thread(target=_send, args=(process.stdin, self._lines), daemon=True)
+            self._sending.start()
+            self._lines.put(self._known)
+            self._process, process.stdin = process, None
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._end()
+
+    def landed(self, number: int, flight: Mapping[str, Any], telemetry: Path) -> None:
+        """Let a flight that is over be drawn.
+
+        Args:
+            number: in the order of the run. flight: as in `run.json`. telemetry: its file.
+        """
+        if self._process is not None:
+            self._lines.put(json.dumps({"number": number, "flight": flight, "telemetry": str(telemetry.resolve())}))
 
     def begin(self, folder: Path) -> None:
         """Let the report be written: `run.json` and the flights' files are there.
@@ -62,8 +79,8 @@ class ReportDraft:
             folder: of the run.
         """
         self._folder = folder
-        with suppress(OSError, ValueError):
-            self._send(json.dumps({"write": str(folder.resolve())}))
+        self._lines.put(json.dumps({"write": str(folder.resolve())}))
+        self._lines.put(None)
 
     def finish(self) -> Path:
         """Wait for the report that was begun.
@@ -96,20 +113,24 @@ class ReportDraft:
             self._end()
         return answer if isinstance(answer, dict) else {}
 
-    def _send(self, line: str) -> None:
-        process = self._process
-        if process is not None and process.stdin is not None:
-            process.stdin.write(line + "\n")
-            process.stdin.flush()
-
     def _end(self) -> None:
         process, self._process = self._process, None
         if process is None:
             return
         with suppress(OSError):
             process.kill()
-        for stream in (process.stdin, process.stdout):
-            if stream is not None:
-                with suppress(OSError):
-                    stream.close()
+        self._lines.put(None)
+        if self._sending is not None:
+            self._sending.join()
+        if process.stdout is not None:
+            with suppress(OSError):
+                process.stdout.close()
         process.wait()
+
+
+def _send(stdin: IO[str], lines: queue.SimpleQueue[str | None]) -> None:
+    """Until there is None, or nobody reads any more."""
+    with suppress(OSError, ValueError), stdin:
+        while (line := lines.get()) is not None:
+            stdin.write(line + "\n")
+            stdin.flush()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 
 from scenarios.limits import TITLES
 from scenarios.report.canvas import INK, SMALL, Drawing, Panel, emphasis, line, within
+from scenarios.report.kept import kept
 from scenarios.report.styles import Style
 from scenarios.report.windows import BAND, BEFORE_S, StepTrace, TrackTrace
 from scenarios.study.figure_style import extremes, stretched
@@ -60,6 +61,7 @@ def step_overlay(sets: Sequence[Drawn], figure: str) -> Drawing:
     )
 
 
+@kept
 def step_figure(trace: StepTrace, style: Style, name: str, figure: str, own: StepTrace | None = None) -> Drawing:
     """One step with rise, overshoot and settling marked.
 
@@ -119,6 +121,7 @@ def _wrapped(text: str) -> list[str]:
     return textwrap.wrap(text, 46)[:4]
 
 
+@kept
 def track_figure(trace: TrackTrace, style: Style, name: str, figure: str, most_deg: float) -> Drawing:
     """A track: set-point and roll.
 
@@ -135,6 +138,22 @@ def track_figure(trace: TrackTrace, style: Style, name: str, figure: str, most_d
     parts = [f"{TITLES[key]} {value:.3g}" for key, value in trace.metrics.items() if value is not None]
     over = f"Roll set-point and roll angle of {name} over {trace.duration_s:g} s: {', '.join(parts)}."
     return Drawing(svg, over + _told(trace.faults))
+
+
+def track_end_deg(traces: Iterable[TrackTrace]) -> float:
+    """End of the angle's axis for the tracks of a run: room for what was asked, whatever the vehicles made of it."""
+    peaks = [float(np.nanmax(np.abs(trace.setpoint_deg), initial=0.0)) for trace in traces]
+    return 1.5 * max([*(peak for peak in peaks if np.isfinite(peak)), 2.0])
+
+
+def step_id(place: int, number: int) -> str:
+    """Name of a step's figure: of the step with that place on the page, of the gain set with that number."""
+    return f"step{place}-{number}"
+
+
+def track_id(place: int, number: int) -> str:
+    """Name of a track's figure, as `step_id`."""
+    return f"track{place}-{number}"
 
 
 @lru_cache(maxsize=8)

@@ -9,7 +9,15 @@ from scenarios.gain_set import load_gain_sets
 from scenarios.markdown import ROLL_GAINS
 from scenarios.report.canvas import Drawing
 from scenarios.report.elements import UNSET, Cell, Figure, Line, Section, Set, Sets, Table, heading, metric_cell
-from scenarios.report.flight_figures import Drawn, step_figure, step_overlay, track_figure
+from scenarios.report.flight_figures import (
+    Drawn,
+    step_figure,
+    step_id,
+    step_overlay,
+    track_end_deg,
+    track_figure,
+    track_id,
+)
 from scenarios.report.verdict import limits_of, title
 from scenarios.report.windows import MARKED, StepTrace, segments_of, step_trace, track_trace
 from sitl.errors import FroudeError
@@ -105,7 +113,7 @@ def step_sections(sets: Sets, telemetry: Telemetries) -> list[Section]:
         owns = _own_traces(sets, name)
         for one, trace in drawn:
             own = owns.get(one.flight.name)
-            figure = step_figure(trace, one.style, one.name, f"step{place}-{one.number}", own)
+            figure = step_figure(trace, one.style, one.name, step_id(place, one.number), own)
             beside = "" if own is None else "Dashed and thin: our own autopilot with the same gains."
             grid.append(_figure(f"step-{place}-{one.number}", one, figure, beside))
         columns = (*MARKED, "droop_deg", "peak_delta_lat", "oscillation_rad_s")
@@ -139,8 +147,6 @@ def _traced(
 
 def track_sections(sets: Sets, telemetry: Telemetries) -> list[Section]:
     """Every track: set-point and roll of each gain set, and the numbers."""
-    import numpy as np
-
     names = segments_of((one.data for one in sets.all), "track")
     made = []
     for place, name in enumerate(names[:MOST_SEGMENTS]):
@@ -148,11 +154,10 @@ def track_sections(sets: Sets, telemetry: Telemetries) -> list[Section]:
         if not drawn:
             made.append(Section(f"track-{place}", _heading("Tracking", name, names), _nothing_recorded()))
             continue
-        peaks = [float(np.nanmax(np.abs(trace.setpoint_deg), initial=0.0)) for _, trace in drawn]
-        most_deg = 1.5 * max([*(peak for peak in peaks if np.isfinite(peak)), 2.0])
+        most_deg = track_end_deg(trace for _, trace in drawn)
         grid = []
         for one, trace in drawn:
-            figure = track_figure(trace, one.style, one.name, f"track{place}-{one.number}", most_deg)
+            figure = track_figure(trace, one.style, one.name, track_id(place, one.number), most_deg)
             grid.append(_figure(f"track-{place}-{one.number}", one, figure))
         columns = ("vaf_pct", "lag_s", "vaf_lag_removed_pct", "rms_error_deg", "peak_delta_lat")
         shown = [name_ for name_ in columns if any(one.flight.metric(name_, name) for one in sets.all)]

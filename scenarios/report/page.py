@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +33,6 @@ def report_page(run: StoredRun, done: Done | None = None, *, threads: int | None
     Args:
         run: read back. done: what has been computed already. threads: None takes all cores.
     """
-    import jinja2
-
     sets = Sets.of(run)
     computed = compute(run.data, [one.data["uploaded"] for one in sets.all], done, threads=threads)
     found = {one.number: computed[key_of(run.data, one.data["uploaded"])] for one in sets.all}
@@ -50,11 +49,7 @@ def report_page(run: StoredRun, done: Done | None = None, *, threads: int | None
         _repeat(run),
     ]
     shares = [_share(found[one.number]) for one in sets.candidates]
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    environment = jinja2.Environment(
-        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    page: str = environment.get_template(TEMPLATE).render(
+    page: str = page_template().render(
         run=run.data,
         name=run.name,
         title=run.data["scenario"]["title"] or run.data["scenario"]["name"] or run.name,
@@ -67,6 +62,18 @@ def report_page(run: StoredRun, done: Done | None = None, *, threads: int | None
         problems=[problem for problem in run.problems if not problem.startswith(COMPARE)],
     )
     return page
+
+
+@cache
+def page_template() -> Any:
+    """The page's template, compiled."""
+    import jinja2
+
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    environment = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.get_template(TEMPLATE)
 
 
 def _loops(sets: Sets, found: Mapping[int, Computed]) -> Iterable[Section | None]:

@@ -169,6 +169,9 @@ def flown_run() -> RunRecord:
 class _NoReport(contextlib.nullcontext):
     """In the place of a `ReportDraft`."""
 
+    def landed(self, number: int, flight: object, telemetry: Path) -> None:
+        pass
+
     def begin(self, folder: Path) -> None:
         pass
 

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import re
+import signal
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
@@ -16,7 +17,7 @@ import pytest
 from scenarios.gain_set import save_params
 from scenarios.job_summary import job_summary, write_job_summary
 from scenarios.limits import Outcome
-from scenarios.report import write_report
+from scenarios.report import canvas, helper, write_report
 from scenarios.report.computed import compute, key_of, loop_curves
 from scenarios.report.drafting import ReportDraft
 from scenarios.report.flown_model import flown_model
@@ -356,6 +357,27 @@ class TestVerdict:
 
 
 class TestDraft:
+    def test_flights_are_drawn_as_they_land(self, folder, data, monkeypatch):
+        run = read_run(folder)
+        sets = [{"name": one.name, "baseline": False, "uploaded": one.data["uploaded"]} for one in run.flights]
+        flown = helper.Flown(sets)
+        for number, one in enumerate(run.flights):
+            flown.draw(number, data["flights"][number], one.files["parquet"])
+        drawn: list[str] = []
+        svg = canvas.Panel.svg
+        monkeypatch.setattr(canvas.Panel, "svg", lambda panel, name: drawn.append(name) or svg(panel, name))
+        before = (folder / "report.html").read_bytes()
+        write_report(folder)
+        assert (folder / "report.html").read_bytes() == before
+        assert not [name for name in drawn if re.fullmatch(r"(step|track)\d+-\d+", name)]
+        assert "steps0" in drawn  # all gain sets over one another need all flights
+
+    def test_who_flies_never_waits_for_the_helper(self, data, folder):
+        with ReportDraft(data, []) as draft:
+            draft._process.send_signal(signal.SIGSTOP)
+            for number in range(40):  # more than any pipe holds
+                draft.landed(number, data["flights"][0], folder / "none.parquet")
+
     def test_without_a_helper_the_page_is_written_all_the_same(self, folder, monkeypatch, data):
         monkeypatch.setattr(sys, "executable", "/nowhere/python")
         (folder / "report.html").unlink()
