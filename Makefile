@@ -33,7 +33,7 @@ demo: $(FLIES)
 
 test: lint vulkan chromium
 	@echo "==> tests"
-	@$(BIN)/python -m pytest --numprocesses=auto --dist=loadfile
+	@$(BIN)/python -m pytest --numprocesses=auto --dist=loadfile --no-loadscope-reorder
 
 lint: $(TESTS)
 	@echo "==> ruff"

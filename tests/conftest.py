@@ -19,6 +19,8 @@ Each = Callable[[int], None]
 
 _states = itertools.count(1)
 _failed = pytest.StashKey[bool]()
+_HERE = Path(__file__).parent
+_LONGEST_FIRST = {"clients": 0, "test_readme.py": 1, "scenarios": 2}
 
 # how long an example takes depends on what else the computer does
 settings.register_profile("no deadline", deadline=None)
@@ -44,6 +46,8 @@ def state_dir(states: Path) -> Iterator[Path]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    # the files that take longest come first: no worker is left with one when the others are done
+    items.sort(key=lambda item: _LONGEST_FIRST.get(item.path.relative_to(_HERE).parts[0], len(_LONGEST_FIRST)))
     # ground stations of others give up after times of their own, which a busy computer may miss
     for item in items:
         if item.get_closest_marker("client"):
