@@ -1,8 +1,8 @@
 """What a fault did to the flight: how far roll was pushed away, how long it took to be back, how much height it cost.
 
 Roll is measured where its set-point stands still and has stood for a second, that is in steps and holds, from the
-fault's begin to the end of that segment: against where roll was when the fault began, so that the droop of a long hold is
-not taken for the fault's doing. Where the set-point moves, the metrics of step and track tell.
+fault's begin to the end of that segment: against where roll was when the fault began, so that the droop of a long hold
+is not taken for the fault's doing. Where the set-point moves, the metrics of step and track tell.
 """
 
 from __future__ import annotations

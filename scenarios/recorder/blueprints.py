@@ -172,7 +172,7 @@ def _lanes(page: Page | None = None) -> Any:
     import rerun.blueprint as rrb
 
     return rrb.StateTimelineView(
-        name="Manoeuvre, flight mode, motors at a limit", origin="/state", time_view=_time_axis(page)
+        name="Manoeuvre, flight mode, motors at a limit, faults", origin="/state", time_view=_time_axis(page)
     )
 
 

@@ -124,6 +124,10 @@ class FlightDrawing:
         """Mark a measured part of the flight."""
         self._segments.append(segment)
 
+    def faults(self, t_s: float, text: str) -> None:
+        """Mark which faults are in force from a vehicle time on; empty for none."""
+        self.recording.lane("/state/fault", t_s, text)
+
     def link(self, t_s: float, counts: LinkCounts) -> None:
         """What the link's counters say at a vehicle time, s; written with the next rows."""
         self._counted.append((t_s, counts))

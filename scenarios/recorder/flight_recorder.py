@@ -104,7 +104,8 @@ class FlightRecorder:
 
     def faults(self, t_s: float, text: str) -> None:
         """Mark which faults are in force from a vehicle time on; empty for none."""
-        self.recording.lane("/state/fault", t_s, text)
+        self._tell("faults", t_s, text)
+        self._drawing.faults(t_s, text)
 
     def link(self, t_s: float, counts: LinkCounts) -> None:
         """What the link's counters say at a vehicle time, s."""

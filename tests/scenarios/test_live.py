@@ -130,6 +130,7 @@ def said_by_a_flight():
         ("begin", "froude", "run-set", "a <set>", vehicle),
         ("rows", rows),
         ("event", 1.25, 6, "text \u00e9 \ud800 " * 5000),
+        ("faults", 1.5, "gust, motor 2 out"),
         ("segment", Segment("step", "step", "step", 1.0, 2.0, 0.17, 0.0)),
         ("link", 0.1, LinkCounts(1, 2, 3, 4, 5)),
         ("end", "# summary", "", {"run": {"seed": 1, "share": 0.5, "vehicle": "ANT-X", "none": None}}),

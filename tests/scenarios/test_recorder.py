@@ -70,6 +70,8 @@ def record(path, flight, **keys):
         recorder.append({name: values[first : first + 250] for name, values in flight.telemetry.columns.items()})
     for event in flight.events:
         recorder.event(event.t_s, event.severity, event.text)
+    recorder.faults(7.0, "motor 2 out")
+    recorder.faults(7.5, "")
     for segment in flight.segments:
         recorder.segment(segment)
     return recorder
@@ -124,6 +126,10 @@ class TestFlight:
             (10.0, "track"),
             (15.0, ""),
         ]
+
+    def test_faults_are_a_lane(self, recorded):
+        times, states = recorded.column("/state/fault", "StateChange:state")
+        assert [(t, state[0]) for t, state in zip(times, states, strict=True)] == [(7.0, "motor 2 out"), (7.5, "")]
 
     def test_events_have_levels(self, recorded):
         _, texts = recorded.column("/events", "TextLog:text")
