@@ -61,7 +61,7 @@ class VehicleProcess:
                 env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"},
             )
         # Compiling the control laws comes first where nobody has flown yet.
-        end = time.monotonic() + 150
+        end = time.monotonic() + 220
         while "Ctrl-C stops" not in self.printed():
             if self._process.poll() is not None or time.monotonic() > end:
                 self._process.kill()
