@@ -2,7 +2,7 @@
 
 Whole frames pass byte for byte, signatures included. What does not pass: the simulator's own messages, either way, so
 that nobody else moves the plant or feeds the board's sensors; more than the line can carry beside the sensors; and,
-unless it was allowed, anything that arms the board.
+unless it was allowed, anything that arms the board or turns a motor, its shell included.
 """
 
 from __future__ import annotations
@@ -18,13 +18,15 @@ BYTES_PER_S = 30_000
 
 BURST_BYTES = 8_192
 
-_ARM, _SET_MODE = 400, 176
+_ARM, _SET_MODE, _CALIBRATE = 400, 176, 241
+_ALWAYS_ARMING = frozenset((300, 209, 310, 183, 184, 187))
+"""MISSION_START, for which a PX4 arms by itself; tests of motors and actuators; servos and actuators set outright."""
 _ARMED = 128
 _DENIED = 2
 _ERROR = 3
 _KEPT_BACK = ("HIL_ACTUATOR_CONTROLS",)
-_STICKS = ("MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE")
-"""Sticks arm by gesture, and nobody can tell from one message that they do."""
+_OPAQUE = ("MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE", "SERIAL_CONTROL")
+"""Sticks arm by gesture and a shell by a word, and nobody can tell from one message that they do."""
 _READER_SYSID, _READER_COMPID = 254, 51
 
 
@@ -82,7 +84,7 @@ class GroundRouter:
         return frames
 
     def _may_pass(self, message: Message, link: Link) -> bool:
-        if message.name.startswith("HIL_") or (message.name in _STICKS and not self.may_arm):
+        if message.name.startswith("HIL_") or (message.name in _OPAQUE and not self.may_arm):
             return False
         if self.may_arm or not arms(message):
             return True
@@ -115,7 +117,7 @@ class GroundRouter:
 
 
 def arms(message: Message) -> bool:
-    """Whether a message asks an autopilot to arm.
+    """Whether a message asks an autopilot to arm, or to turn a motor unarmed.
 
     Args:
         message: of a ground station.
@@ -123,6 +125,11 @@ def arms(message: Message) -> bool:
     if message.name in ("COMMAND_LONG", "COMMAND_INT"):
         if message.command == _ARM:
             return bool(message.param1 != 0.0)
+        if message.command == _CALIBRATE:  # its last parameter is the motors' speed controllers, which then turn
+            last = message.param7 if message.name == "COMMAND_LONG" else message.z
+            return bool(last != 0.0)
+        if message.command in _ALWAYS_ARMING:
+            return True
         return bool(message.command == _SET_MODE and _armed_bit(message.param1))
     return bool(message.name == "SET_MODE" and message.base_mode & _ARMED)
 

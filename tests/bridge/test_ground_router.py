@@ -82,11 +82,16 @@ def test_arming_is_refused_in_the_boards_name_unless_allowed() -> None:
     assert allowed.router.from_grounds(0) == [frame]
 
 
-def test_sticks_may_arm_by_gesture_so_they_need_the_same_leave() -> None:
+def test_sticks_may_arm_by_gesture_and_a_shell_by_a_word_so_they_need_the_same_leave() -> None:
     for may_arm in (False, True):
-        rig = Rig(may_arm=may_arm)
-        rig.asks(0, "MANUAL_CONTROL", target=1, x=0, y=0, z=0, r=1000)
-        assert bool(rig.router.from_grounds(0)) is may_arm
+        for name, fields in (
+            ("MANUAL_CONTROL", {"target": 1, "z": 0, "r": 1000}),
+            ("RC_CHANNELS_OVERRIDE", {"target_system": 1, "chan3_raw": 1000, "chan4_raw": 2000}),
+            ("SERIAL_CONTROL", {"device": 10, "flags": 6, "count": 14, "data": b"commander arm\n"}),
+        ):
+            rig = Rig(may_arm=may_arm)
+            rig.asks(0, name, **fields)
+            assert bool(rig.router.from_grounds(0)) is may_arm, name
 
 
 @pytest.mark.parametrize(
@@ -102,6 +107,12 @@ def test_sticks_may_arm_by_gesture_so_they_need_the_same_leave() -> None:
         ("SET_MODE", {"target_system": 1, "base_mode": 129, "custom_mode": 0}, True),
         ("SET_MODE", {"target_system": 1, "base_mode": 1, "custom_mode": 0}, False),
         ("PARAM_SET", {"param_id": "MC_ROLL_P"}, False),
+        *(("COMMAND_LONG", {"command": number}, True) for number in (300, 209, 310, 183, 184, 187)),
+        *(("COMMAND_INT", {"command": number}, True) for number in (300, 209, 310, 183, 184, 187)),
+        ("COMMAND_LONG", {"command": 241, "param7": 1.0}, True),
+        ("COMMAND_INT", {"command": 241, "z": 1.0}, True),
+        ("COMMAND_LONG", {"command": 241, "param1": 1.0}, False),
+        ("COMMAND_LONG", {"command": 22, "param7": 10.0}, False),
     ],
 )
 def test_what_arms(name: str, fields: dict[str, object], arming: bool) -> None:
