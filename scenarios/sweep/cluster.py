@@ -62,6 +62,7 @@ class Dask:
         self._plan, self._address, self._make = plan, address, make
         self._clock = WallClock()
         self._token = uuid4().hex[:12]
+        self._next_look_us, self._lost = 0, 0
 
     def __enter__(self) -> Dask:
         """Connect, and look at every worker.
@@ -75,6 +76,7 @@ class Dask:
             check_workers(self._client, self._address)
             self._threads: dict[str, int] = dict(self._client.nthreads())
             self.workers = len(self._threads)
+            self._alone_since_us = self._clock.now_us()
             if self._address != LOCAL or importlib.util.find_spec("bokeh"):  # without bokeh it has nothing to show
                 self.name += f", dashboard {self._client.dashboard_link}"
             self._kept = stack.pop_all()
@@ -92,6 +94,7 @@ class Dask:
         with ExitStack() as stack:
             if self._address == LOCAL:
                 where: Any = stack.enter_context(_local_cluster(self.workers))
+                self._local = where
             else:
                 where = self._address
                 asyncio.run(scheduler_answers(where))
@@ -116,6 +119,10 @@ class Dask:
         # the scheduler gives work first to those who have what it needs
         with contextlib.suppress(Exception):
             self._client.replicate([self._sent])
+
+    def pids(self) -> list[int]:
+        """Of the workers of a cluster on this machine that have started."""
+        return [nanny.pid for nanny in list(self._local.workers.values()) if nanny.pid]
 
     def run(self, tasks: Iterable[Task]) -> Iterator[Result]:
         """Results as they come; what was given up is tried again at the end, one by one."""
@@ -142,17 +149,27 @@ class Dask:
         try:
             self._fill(running, source, done)
             while running:
-                lost = self._look()
+                self._look()
                 try:
                     future = done.get(timeout=_LOOK_EVERY_S)
                 except Empty:
                     continue
-                task = running.pop(future)
+                columns: Columns | None
                 try:
-                    yield Result(task, self._result(future), lost)
+                    columns = self._result(future)
+                except TimeoutError:
+                    # it went with its worker after it was done, and is being worked out again
+                    done.put(future)
+                    continue
                 except KilledWorker:
-                    yield task
+                    columns = None
+                task = running.pop(future)
                 future.release()
+                if columns is None:
+                    yield task
+                else:
+                    lost, self._lost = self._lost, 0
+                    yield Result(task, columns, lost)
                 self._fill(running, source, done)
         finally:
             if running:
@@ -174,8 +191,10 @@ class Dask:
         from distributed.client import FutureCancelledError
 
         try:
-            columns: Columns = future.result(timeout=CONNECT_S)
-        except (FutureCancelledError, OSError, TimeoutError):
+            columns: Columns = future.result(timeout=_LOOK_EVERY_S)
+        except TimeoutError:
+            raise
+        except (FutureCancelledError, OSError):
             raise LinkError(
                 f"{self._address}: the scheduler has gone. What is done is kept: go on with --resume"
             ) from None
@@ -186,16 +205,16 @@ class Dask:
             ) from None
         return columns
 
-    def _look(self) -> int:
-        """Count the workers, once a second; how many have gone since."""
+    def _look(self) -> None:
+        """Count the workers, once a second."""
         now_us = self._clock.now_us()
         if now_us < self._next_look_us:
-            return 0
+            return
         self._next_look_us = now_us + round(_LOOK_EVERY_S * 1e6)
         try:
             found = dict(self._client.nthreads())
         except (OSError, TimeoutError, RuntimeError, ValueError):
-            return 0  # a scheduler that has gone is told of by what it had
+            return  # a scheduler that has gone is told of by what it had
         if found:
             self._alone_since_us = now_us
         elif now_us - self._alone_since_us > _PATIENCE_S * 1e6:
@@ -204,12 +223,8 @@ class Dask:
             )
         if found.keys() - self._threads.keys():
             self._spread_plan()
-        lost = len(self._threads.keys() - found.keys())
+        self._lost += len(self._threads.keys() - found.keys())
         self._threads = found
-        return lost
-
-    _next_look_us = 0
-    _alone_since_us = 0
 
 
 def _same(plan: Plan) -> Plan:
