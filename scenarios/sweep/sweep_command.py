@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import itertools
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +14,6 @@ if TYPE_CHECKING:
     from scenarios.sweep.dataset import Dataset
     from scenarios.sweep.engines import Engine
     from scenarios.sweep.plan import Plan
-    from scenarios.sweep.sweeping import Progress
 
 EXIT_OK, EXIT_GATE = 0, 1
 NEWEST = "newest"
@@ -25,7 +26,7 @@ Tell = Callable[[str], object]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `froude sweep`."""
     add = parser.add_argument
-    add("sweep", nargs="?", metavar="SWEEP.toml", help="axes, design, manoeuvres and limits; see the README")
+    add("sweep", nargs="?", metavar="SWEEP.toml", help="axes, design, manoeuvres and limits; or a name, roll_gains")
     add("--out", metavar="DIR", default="logs", help="folder that the sweep's folder is made in (default: logs)")
     add(
         "--resume",
@@ -37,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--show", nargs="?", const=NEWEST, metavar="DIR", help="show a sweep: its folder, or the newest")
     add("--jobs", type=int, default=0, metavar="N", help="workers (default: one a core)")
     add("--engine", choices=("auto", "in-process", "processes"), default="auto", help="who works (default: by size)")
+    add("--dask", metavar="ADDRESS", help="work on a Dask cluster, tcp://HOST:8786; or local: one made on this machine")
     add("--fly", type=int, default=0, metavar="K", help="fly the best K candidates over MAVLink in every condition")
     add("--px4", metavar="DIR", help="fly them with a real PX4, too: its build directory")
     add("--json", action="store_true", help="for machines")
@@ -56,6 +58,7 @@ def run(args: argparse.Namespace, *, tell: Tell) -> int:
         UsageError, FileError: before any work: a bad file, folder or number.
         LinkError: a cluster that does not answer.
     """
+    from scenarios.sweep.sweep_file import find_sweep
     from sitl.errors import UsageError
 
     if args.show is not None:
@@ -70,42 +73,58 @@ def run(args: argparse.Namespace, *, tell: Tell) -> int:
         return _show(path, args, tell)
     if args.sweep is None and args.resume is None:
         raise UsageError("give a SWEEP.toml, --resume to go on with a sweep, or --show to look at one")
+    if args.sweep is not None:
+        args.sweep = str(find_sweep(args.sweep))
     if args.jobs < 0:
         raise UsageError(f"--jobs {args.jobs}: give 1 or more")
     _check_fly(args)
-    plan, dataset = _begin(args, tell)
+    if args.dask is not None and args.engine != "auto":
+        raise UsageError(f"--dask and --engine {args.engine} are two engines: leave out one of them")
+    plan, begun = _begin(args)
     for warning in plan.warnings:
         tell(warning)
-    _work(plan, dataset, args, tell)
+    dataset = _work(plan, begun, args, tell)
     if args.fly:
         _fly(dataset.path, args, tell)
     return _show(dataset.path, args, tell)
 
 
-def _begin(args: argparse.Namespace, tell: Tell) -> tuple[Plan, Dataset]:
-    """The plan, and the folder that it is kept in: a new one, or the one to go on with."""
-    from bridge.clock import utc_stamp
+def _begin(args: argparse.Namespace) -> tuple[Plan, Dataset | None]:
+    """The plan, and the dataset to go on with; none for a new sweep, whose folder is made when all is ready."""
     from scenarios.sweep.dataset import Dataset
     from scenarios.sweep.plan import make_plan
-    from scenarios.sweep.program import program_facts
     from scenarios.sweep.resuming import plan_of
     from scenarios.sweep.sweep_file import load_sweep
 
-    if args.resume is not None:
-        name = Path(args.sweep).stem if args.sweep else ""
-        dataset = Dataset(_folder(args.resume, Path(args.out), name))
-        plan = plan_of(dataset, Path(args.sweep) if args.sweep else None)
-        return plan, dataset
-    plan = make_plan(load_sweep(Path(args.sweep)))
+    if args.resume is None:
+        return make_plan(load_sweep(Path(args.sweep))), None
+    name = Path(args.sweep).stem if args.sweep else ""
+    dataset = Dataset(_folder(args.resume, Path(args.out), name))
+    return plan_of(dataset, Path(args.sweep) if args.sweep else None), dataset
+
+
+def _new(plan: Plan, args: argparse.Namespace) -> Dataset:
+    """A dataset in a folder of its own, even if another sweep starts in the same second."""
+    from bridge.clock import utc_stamp
+    from scenarios.sweep.dataset import Dataset
+    from scenarios.sweep.program import program_facts
+    from sitl.errors import FileError
+
     stamp = utc_stamp()
-    path = Path(args.out) / f"{stamp}_sweep_{plan.sweep.name}"
-    attempt = 1
-    while path.exists():
-        attempt += 1
-        path = path.with_name(f"{stamp}_sweep_{plan.sweep.name}_{attempt}")
+    for attempt in itertools.count(1):
+        path = Path(args.out) / (f"{stamp}_sweep_{plan.sweep.name}" + (f"_{attempt}" if attempt > 1 else ""))
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            if path.is_dir():
+                continue
+            raise FileError(args.out, "is a file, not a folder", "Choose another folder with --out") from None
+        except OSError as error:
+            raise FileError(path, f"cannot be made: {error.strerror}", "Choose another folder with --out") from error
+        break
     dataset = Dataset(path)
     dataset.create(plan, {"started_utc": stamp, "command": list(args.argv), **program_facts()})
-    return plan, dataset
+    return dataset
 
 
 def _folder(named: str, base: Path, name: str) -> Path:
@@ -126,24 +145,36 @@ def _folder(named: str, base: Path, name: str) -> Path:
 def _engine(plan: Plan, args: argparse.Namespace) -> Engine:
     from scenarios.sweep.engines import InProcess, Processes
 
+    if args.dask is not None:
+        from scenarios.sweep.cluster import Dask
+
+        return Dask(plan, args.dask, args.jobs)
     small = plan.points * plan.steps_per_point < SMALL_STEPS
     if args.engine == "in-process" or (args.engine == "auto" and small):
         return InProcess(plan, args.jobs)
     return Processes(plan, args.jobs)
 
 
-def _work(plan: Plan, dataset: Dataset, args: argparse.Namespace, tell: Tell) -> Progress:
+def _work(plan: Plan, begun: Dataset | None, args: argparse.Namespace, tell: Tell) -> Dataset:
     from scenarios import interrupts
     from scenarios.sweep.sweep_progress import watching
     from scenarios.sweep.sweeping import sweep_points
 
-    with interrupts.caught(), dataset.locked(), _engine(plan, args) as engine:
+    with interrupts.caught(), contextlib.ExitStack() as stack:
+        if begun is not None:
+            stack.enter_context(begun.locked())
+        engine = stack.enter_context(_engine(plan, args))
+        # a cluster that does not answer leaves no folder behind
+        dataset = begun or _new(plan, args)
+        if begun is None:
+            stack.enter_context(dataset.locked())
         try:
             with watching(plan, engine, tell) as show:
-                return sweep_points(plan, dataset, engine, show)
+                sweep_points(plan, dataset, engine, show)
         except KeyboardInterrupt:
             tell(f"stopped; what is done is kept. Go on with: froude sweep --resume {dataset.path}")
             raise
+    return dataset
 
 
 def _check_fly(args: argparse.Namespace) -> None:
@@ -167,6 +198,7 @@ def _fly(path: Path, args: argparse.Namespace, tell: Tell) -> None:
         text = fly_best(
             path,
             args.fly,
+            source=Path(args.sweep) if args.sweep else None,
             px4=None if args.px4 is None else Path(args.px4),
             jobs=args.jobs,
             command=("froude", *args.argv),
