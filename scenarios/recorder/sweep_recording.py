@@ -149,16 +149,15 @@ def _bars(recording: Recording, ranking: Ranking) -> None:
 
 def _summary(ranking: Ranking) -> str:
     sweep = ranking.sweep
-    head = ["rank", "candidate", *(axis.name for axis in sweep.axes), "cases passed", "worst case"]
-    head += [objective_title(one) for one in sweep.objectives]
+    head = ["rank", "candidate", "cases passed", "worst case", *(objective_title(one) for one in sweep.objectives)]
+    head += [axis.name for axis in sweep.axes]
     rows = []
     for place, candidate in enumerate(ranking.order[:ROWS].tolist(), 1):
-        row = [str(place), str(candidate), *(f"{value:.4g}" for value in ranking.values_of(candidate).values())]
+        row = [str(place), str(candidate)]
         row += [f"{ranking.passed[candidate]}/{len(sweep.cases)}", worst_text(ranking, candidate)]
-        row += [
-            shown_objective(one, ranking.objective(candidate, k), unit=False) for k, one in enumerate(sweep.objectives)
-        ]
-        rows.append(row)
+        for k, one in enumerate(sweep.objectives):
+            row.append(shown_objective(one, ranking.objective(candidate, k), unit=False))
+        rows.append(row + [f"{value:.4g}" for value in ranking.values_of(candidate).values()])
     said = [f"## {headline(ranking)}", choice(ranking) + "."]
     said += [f"- {line}" for line in doubts(ranking, None)]
     said.append(markdown_table(head, rows, ()))

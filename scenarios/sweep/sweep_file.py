@@ -15,15 +15,16 @@ from scenarios.limits import Limit
 from scenarios.manoeuvres import Manoeuvre, parse_manoeuvres
 from scenarios.metrics import LAST_S, SETTLE_S
 from scenarios.monte_carlo import MAX_SAMPLES
-from scenarios.scenario import beside, read_limits
+from scenarios.scenario import LIBRARY_DIR, beside, read_limits
 from scenarios.sweep.axes import ConditionAxis, ParameterAxis, parse_axes
 from scenarios.sweep.objectives import Objective, parse_objectives
 from scenarios.toml_file import read_toml
-from sitl.errors import UsageError
+from sitl.errors import FileError, UsageError
 from sitl.keyed_table import KeyedTable, nearest
 from sitl.parameters import parameter_specs
 from sitl.uncertainty import DISTRIBUTIONS, MAX_SPREAD, MIN_SPREAD, Distribution
 
+SWEEPS_DIR = LIBRARY_DIR / "sweeps"
 GRID, SOBOL, LATIN, SEARCH = "grid", "sobol", "latin-hypercube", "search"
 DESIGNS = (GRID, SOBOL, LATIN, SEARCH)
 MARGINS = ("samples", "nominal", "none")
@@ -87,15 +88,38 @@ class Sweep:
     text: str
 
 
-def load_sweep(path: Path) -> Sweep:
+def list_sweeps() -> tuple[str, ...]:
+    """Names of the sweeps that come with the program."""
+    return tuple(sorted(path.stem for path in SWEEPS_DIR.glob("*.toml")))
+
+
+def find_sweep(name_or_path: str | Path) -> Path:
+    """The file that is meant.
+
+    Args:
+        name_or_path: of the library (`roll_gains`), or the path of a TOML file.
+
+    Raises:
+        FileError: there is none; names the nearest of the library.
+    """
+    for path in (Path(name_or_path), SWEEPS_DIR / f"{name_or_path}.toml"):
+        if path.is_file():
+            return path
+    known = list_sweeps()
+    hint = f"In the library: {', '.join(known)}; or give the path of a .toml file"
+    raise FileError(name_or_path, f"no such sweep{nearest(Path(name_or_path).stem, known)}", hint)
+
+
+def load_sweep(name_or_path: str | Path) -> Sweep:
     """Read and check a sweep file.
 
     Args:
-        path: of the TOML file.
+        name_or_path: as `find_sweep`.
 
     Raises:
-        FileError: it cannot be read, or anything in it cannot be swept; names file, key and value.
+        FileError: there is none, it cannot be read, or anything in it cannot be swept; names file, key and value.
     """
+    path = find_sweep(name_or_path)
     data = read_toml(path)
     file = KeyedTable(path, data)
     text = path.read_text(encoding="utf-8")
