@@ -135,13 +135,14 @@ def track_trace(flight: Mapping[str, Any], telemetry: Telemetry, name: str) -> T
 
 
 def _faults(flight: Mapping[str, Any], segment: Mapping[str, Any]) -> list[tuple[float, float]]:
-    """From when to when faults were in force within a segment, s from its start."""
+    """From when to when faults were in force within a segment, s from its start; not those of its whole length."""
     start_s, end_s = segment["start_s"], segment["end_s"]
     spans = []
     for fault in flight["faults"]:
         if fault["start_s"] is not None:
             until_s = end_s if fault["end_s"] is None else fault["end_s"]
-            spans.append((max(fault["start_s"], start_s) - start_s, min(until_s, end_s) - start_s))
+            if fault["start_s"] > start_s or until_s < end_s:
+                spans.append((max(fault["start_s"], start_s) - start_s, min(until_s, end_s) - start_s))
     return [(begin, end) for begin, end in spans if end > begin]
 
 
