@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
@@ -75,6 +76,25 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     for report in terminalreporter.getreports("rerun"):
         terminalreporter.write_sep("_", f"why {report.nodeid} was tried again")
         terminalreporter.write_line(report.longreprtext)
+
+
+class _NoReport(contextlib.nullcontext):
+    """In the place of a `ReportDraft`."""
+
+    def landed(self, number: int, flight: object, telemetry: Path) -> None:
+        pass
+
+    def begin(self, folder: Path) -> None:
+        pass
+
+    def finish(self) -> None:
+        pass
+
+
+@pytest.fixture
+def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs of this test write no report: it takes longer than a short flight, and it has tests of its own."""
+    monkeypatch.setattr("scenarios.runner.report_draft", lambda *_: _NoReport())
 
 
 class Flight:

@@ -117,6 +117,7 @@ def test_the_tolerances_of_a_comparison_are_those_of_the_code() -> None:
 FLOWN = [words for words in COMMANDS if words[0] == "fly" and any(name in " ".join(words) for name in FILES)]
 
 
+@pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize("words", FLOWN, ids=" ".join)
 def test_the_files_shown_fly(words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status = cli.main([*words, "--json"])

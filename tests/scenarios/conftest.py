@@ -1,10 +1,8 @@
 """A run of three flights as the runner would hand it to the outputs: one passes, one oscillates, one was broken off."""
 
-import contextlib
 import dataclasses
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -164,25 +162,6 @@ def flown_run() -> RunRecord:
     return RunRecord(
         scenario, vehicle, profile, (passes, cycles, broken), None, "2026-11-22T20:00:00Z", {"froude": "0.1.0"}
     )
-
-
-class _NoReport(contextlib.nullcontext):
-    """In the place of a `ReportDraft`."""
-
-    def landed(self, number: int, flight: object, telemetry: Path) -> None:
-        pass
-
-    def begin(self, folder: Path) -> None:
-        pass
-
-    def finish(self) -> None:
-        pass
-
-
-@pytest.fixture
-def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs of this test write no report: it takes longer than a short flight, and it has tests of its own."""
-    monkeypatch.setattr("scenarios.runner.report_draft", lambda *_: _NoReport())
 
 
 QuickScenario = Callable[..., Scenario]

@@ -72,6 +72,7 @@ def own_airframe(path: Path, **changes: tuple[str, str]) -> Path:
 
 
 class TestFiles:
+    @pytest.mark.usefixtures("without_report")
     def test_flies_what_it_wrote(self, froude: Froude, tmp_path: Path) -> None:
         """Tuned with motors and filters, flown over MAVLink with sensor noise: passes, and is quiet."""
         out = tmp_path / "new" / "folder" / "mine.toml"
