@@ -35,8 +35,8 @@ def faults_section(sets: Sets) -> Section | None:
         ),
     ]
     lead = [
-        "The same faults were put into every flight, at the same time of the same manoeuvre. Plots show shaded when they "
-        "were in force, but for those that lasted throughout."
+        "The same faults were put into every flight, at the same time of the same manoeuvre. Plots show shaded when "
+        "they were in force, but for those that lasted throughout."
     ]
     return Section("faults", "Faults", lead, tables=tables, notes=[*_links(flights), *_reasons(flights)])
 
