@@ -31,9 +31,11 @@ demo: $(FLIES)
 	@echo "==> flying the demo (the first flight compiles the control laws: up to half a minute)"
 	@$(BIN)/froude fly
 
+# A temporary folder of its own: pytest clears away those of earlier runs, and fails where another pytest does so, too.
 test: lint vulkan chromium
 	@echo "==> tests"
-	@$(BIN)/python -m pytest --numprocesses=auto --dist=loadfile --no-loadscope-reorder
+	@folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && \
+	  $(BIN)/python -m pytest --numprocesses=auto --dist=loadfile --no-loadscope-reorder --basetemp="$$folder/pytest"
 
 lint: $(TESTS)
 	@echo "==> ruff"
