@@ -139,7 +139,7 @@ class Dataset:
             "schema_version": SCHEMA_VERSION,
             "fingerprint": plan.fingerprint,
             "title": plan.sweep.title,
-            "file": str(plan.sweep.path),
+            "file": str(plan.sweep.path.resolve()),
             "text": plan.sweep.text,
             "points": plan.points,
             "candidates": plan.candidates,
@@ -182,6 +182,9 @@ class Dataset:
                 f"schema_version = {version!r}, this program writes {SCHEMA_VERSION}",
                 "Read it with the version of froude that made it, or start the sweep anew",
             )
+        for key in ("fingerprint", "file", "plan", "points"):
+            if key not in found:
+                raise FileError(path, f"is damaged: {key} is missing", "Start the sweep anew")
         return dict(found)
 
     @contextlib.contextmanager

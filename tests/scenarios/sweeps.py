@@ -10,6 +10,7 @@ import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -69,10 +70,12 @@ def plan_of(path: Path, text: str, block: int = 0) -> Plan:
     return dataclasses.replace(plan, block=block) if block else plan
 
 
-def swept(plan: Plan, engine: Engine, folder: Path) -> tuple[dict[str, bytes], Progress]:
-    """Every file of the dataset that an engine makes, and what was told of it."""
+def swept(
+    plan: Plan, engine: Engine, folder: Path, facts: dict[str, Any] | None = None
+) -> tuple[dict[str, bytes], Progress]:
+    """Every file of the dataset that an engine makes, and what was told of it; `facts` are kept beside it."""
     dataset = Dataset(folder)
-    dataset.create(plan, {})
+    dataset.create(plan, facts or {})
     with dataset.locked(), engine as entered:
         progress = sweep_points(plan, dataset, entered)
     return files(folder), progress
