@@ -6,7 +6,7 @@ import math
 from collections import deque
 from typing import Any
 
-from bridge.connection import Connection
+from bridge.connection import Connection, Message
 from bridge.errors import FieldError
 from bridge.link import Link
 from bridge.streams import LinkMode, Schedule
@@ -36,6 +36,7 @@ class ServerLink:
         peers: (sysid, compid) of everybody heard here.
         heard_us: vehicle time of the last bytes.
         gcs_seen_us: vehicle time of a ground station's last HEARTBEAT, None before the first.
+        waiting: messages that came and are not handled yet; those of one datagram, or one piece of a stream.
     """
 
     def __init__(self, link: Link, connection: Connection, link_id: int, mode: LinkMode) -> None:
@@ -45,6 +46,7 @@ class ServerLink:
         self.mode = mode
         self.schedule = Schedule(mode)
         self.peers: set[tuple[int, int]] = set()
+        self.waiting: deque[Message] = deque()
         self.gcs_seen_us: int | None = None
         self.heard_us = 0
         self.resting_until_us = 0

@@ -24,6 +24,7 @@ from bridge.offboard import OffboardSetpoints
 from bridge.server_link import ServerLink
 from bridge.services import Service, Services, VehicleFiles
 from bridge.telemetry import Source
+from bridge.text_budget import TextBudget
 from sitl.modes import Mode, Result, Severity
 from sitl.vehicle import Vehicle
 
@@ -34,14 +35,16 @@ _BURST_US = 4_000
 _SLOW_US = 20_000
 """How often services are asked for what is due: while one sends in bursts, and otherwise."""
 _REPEAT_US = 1_000_000
-_DATAGRAMS_PER_TICK = 64
-_BYTES_PER_TICK = 16_384
+_MESSAGES_PER_TICK = 32
+_ANSWERS_PER_TICK = 128
+_BYTES_PER_TICK = 4_096
+"""What one link is listened to before the vehicle flies on: 8000 messages a second, or 1 MB. More waits its turn, and
+is lost where its wire loses what is not read; so whoever floods one link does not keep the vehicle from the others."""
+
 _QUIET_US = 100_000
 """A stream that is silent for so long does not go on with the frame it has begun."""
 _PEERS_KEPT = 128
 _PUT_OFF_MOST = 10
-_TEXTS_AT_ONCE, _TEXT_EVERY_US = 50, 50_000
-"""Texts that may be said at once, and how long it takes until there may be one more: nobody can flood a link."""
 _LOST_PEER_PAUSE_US = 100_000
 
 
@@ -86,7 +89,7 @@ class VehicleServer:
         self.behind = False
         self._put_off = 0
         self._said_us: dict[str, int] = {}
-        self._text_room, self._text_us = _TEXTS_AT_ONCE * _TEXT_EVERY_US, 0
+        self._texts, self._own_texts = TextBudget(), TextBudget()
         self._acknowledged: list[tuple[int, Result, int, int]] = []
         self._log: FlightLog | None = None
         self.services = Services(
@@ -169,14 +172,14 @@ class VehicleServer:
         for link in self.links:
             if now_us >= link.resting_until_us:
                 try:
-                    data = link.link.recv()
-                    if data is not None:
+                    data = None if link.waiting else link.link.recv()
+                    if data is not None or link.waiting:
                         link.heard_us = now_us
                         self._receive(link, data)
                         self._housekeeping_us = now_us
                     elif link.connection.pending and now_us - link.heard_us >= _QUIET_US:
-                        for msg in link.connection.flush():
-                            self._handle(link, msg)
+                        link.waiting.extend(link.connection.flush())
+                        self._receive(link, None)
                 except (PeerLost, LinkClosed):
                     self._peer_lost(link)
                 except Exception as error:
@@ -188,16 +191,16 @@ class VehicleServer:
         self.services.close()
 
     def say(self, severity: Severity, text: str) -> None:
+        """Say what somebody's message has brought about; there is only room for so much of that."""
+        if self._texts.allows(text, self.vehicle.time_us):
+            self._say(severity, text)
+
+    def _say(self, severity: Severity, text: str) -> None:
         """Send a text to every ground station that is there, and as an event what is one.
 
         A text that ends with a TAB is one that ground stations with events drop; if it is none of ours it keeps no TAB.
         """
         now_us = self.vehicle.time_us
-        self._text_room = min(_TEXTS_AT_ONCE * _TEXT_EVERY_US, self._text_room + now_us - self._text_us)
-        self._text_us = now_us
-        if self._text_room < _TEXT_EVERY_US:
-            return
-        self._text_room -= _TEXT_EVERY_US
         if self._log is not None:
             self._log.text(int(severity), text.rstrip("\t"))
         if text.endswith("\t") and not self.services.events.report(severity, text[:-1], now_us):
@@ -247,20 +250,25 @@ class VehicleServer:
         return any(link.hears_gcs(self.vehicle.time_us) for link in self.links)
 
     def _receive(self, link: ServerLink, data: bytes | None) -> None:
-        """Handle what came in on a link; a flood is left for the next ticks."""
-        room = _BYTES_PER_TICK
-        for _ in range(_DATAGRAMS_PER_TICK):
-            if data is None:
+        """Handle what came in on a link, and more while there is room for it.
+
+        Args:
+            link: the link. data: what was read already.
+        """
+        connection, waiting = link.connection, link.waiting
+        most_sent = connection.sent + _ANSWERS_PER_TICK
+        messages, room = _MESSAGES_PER_TICK, _BYTES_PER_TICK
+        while messages > 0 and connection.sent < most_sent:
+            if waiting:
+                messages -= 1
+                self._handle(link, waiting.popleft())
+                continue
+            if data is None and (room <= 0 or (data := link.link.recv()) is None):
                 return
-            for msg in link.connection.receive(data):
-                self._handle(link, msg)
             room -= len(data)
-            if room <= 0:
-                return
-            data = link.link.recv()
-        if data is not None:
-            for msg in link.connection.receive(data):
-                self._handle(link, msg)
+            waiting.extend(connection.receive(data))
+            messages -= not waiting  # to look through nonsense is work, too
+            data = None
 
     def _handle(self, link: ServerLink, msg: Message) -> None:
         sender = (msg.sysid, msg.compid)
@@ -302,7 +310,8 @@ class VehicleServer:
         # items of a mission may be reached one right after the other
         busy = self._put_off > 0 or self.vehicle.autopilot.mode is Mode.MISSION
         for text in self.vehicle.autopilot.take_texts():
-            self.say(text.severity, text.text)
+            if self._own_texts.allows(text.text, now_us):
+                self._say(text.severity, text.text)
         self._put_off = self._put_off + 1 if self.behind and self._put_off < _PUT_OFF_MOST else 0
         services = () if self._put_off else self.services.bursting
         if now_us >= self._slow_us:
@@ -319,18 +328,28 @@ class VehicleServer:
                 if link.texts:
                     link.send_texts(now_us)
                 for service in services:
-                    for name, fields in service.poll(link.link_id, now_us):
-                        link.send(name, fields)
-                        busy = True
+                    busy = self._poll(service, link, now_us) or busy
             except (PeerLost, LinkClosed):
                 self._peer_lost(link)
-            except Exception as error:
-                self._defect("housekeeping", error)
+        return busy
+
+    def _poll(self, service: Service, link: ServerLink, now_us: int) -> bool:
+        """Send what a service owes a link; return whether there was anything. A defect keeps no other from its turn."""
+        busy = False
+        try:
+            for name, fields in service.poll(link.link_id, now_us):
+                link.send(name, fields)
+                busy = True
+        except (PeerLost, LinkClosed):
+            raise
+        except Exception as error:
+            self._defect("housekeeping", error)
         return busy
 
     def _peer_lost(self, link: Any) -> None:
         """Forget who was there; a listening link may get another peer, so try again a little later."""
         link.peers.clear()
+        link.waiting.clear()
         link.gcs_seen_us = None
         link.resting_until_us = self.vehicle.time_us + _LOST_PEER_PAUSE_US
         self.forwarder.forget(link.link_id)

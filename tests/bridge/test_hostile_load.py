@@ -145,7 +145,7 @@ def test_a_command_again_and_again_leaves_nothing_behind(number: int) -> None:
     for k in range(60):
         for compid in range(60):
             watched.put(Connection(255, 1 + compid).encode("COMMAND_LONG", command=number, param1=k % 3, **TARGET))
-        watched.tick()
+        watched.tick(3)
     assert weight(watched.server) - before < 150_000
     watched.run(1.5)
     assert watched.answers(0, ANSWER_TICKS)
@@ -187,7 +187,7 @@ def test_any_number_of_senders_costs_a_bounded_amount() -> None:
         for sysid in range(0, 256):
             frames = [frame_of(kind, payload, sysid=sysid, compid=compid) for compid in range(0, 256, 4)]
             watched.put(b"".join(frames))
-            watched.tick()
+            watched.tick(3)
         return weight(watched.server)
 
     first = from_everybody()
