@@ -16,6 +16,13 @@ _CHUNK = 8_192
 _STUCK_S = 1.0
 _RETRY_US = 50_000
 
+_HELD_BYTES = 65_536
+"""What a peer has not read is held back up to this; a larger piece is waited for."""
+
+_NO_MAVLINK = (b"GET ", b"POST", b"PUT ", b"HEAD", b"OPTI", b"PATC", b"DELE", b"CONN", b"TRAC", b"\x16\x03")
+"""How a browser begins, in the open and encrypted: any page may make it call a port of this computer, with bytes of the
+page's choice behind such a beginning."""
+
 _KERNEL_WAITS_S = 0.02
 """Time limits from here on are left to the kernel, whose clock is too coarse for shorter ones: one call less for every
 answer of an autopilot in lockstep."""
@@ -28,6 +35,8 @@ class TcpLink(Link):
       each; the link itself lives on and a further `recv` waits for the next peer. Without a peer, sends are
       dropped.
     - `connect`: PeerLost is final; every further use repeats it.
+
+    A peer that does not read holds nobody up: the rest of a frame waits for it, further ones are dropped.
     """
 
     datagram = False
@@ -40,6 +49,9 @@ class TcpLink(Link):
         self._lost: str | None = None
         self._clock = WallClock()
         self._limit_s = 0.0
+        self._unsent = b""
+        self._stuck_us: int | None = None  # wall clock since when it takes nothing
+        self._unheard = listener is not None
         if listener is not None:
             listener.setblocking(False)
         if peer is not None:
@@ -107,26 +119,45 @@ class TcpLink(Link):
         return self._peer is not None
 
     def send(self, data: bytes) -> None:
-        """Send all the bytes; a peer that takes none of them for a second is taken for lost."""
+        """Send all the bytes, or none and count them; a peer that takes none for a second is taken for lost."""
         peer = self._present(0.0)
-        if peer is None:
+        if peer is None or (self._unsent and not self._push(peer)):
             self.dropped += 1
             return
-        view = memoryview(data)
+        self._unsent = data
+        self._push(peer)
+
+    def _push(self, peer: socket.socket) -> bool:
+        """Hand over what is held back; whether that was all."""
+        view = memoryview(self._unsent)
         while view:
             try:
                 view = view[peer.send(view, socket.MSG_DONTWAIT) :]
+                self._stuck_us = None
             except BlockingIOError:
+                if len(view) <= _HELD_BYTES:
+                    break
                 if not select.select([], [peer], [], _STUCK_S)[1]:
                     raise self._parted(f"it read nothing for {_STUCK_S:g} s") from None
             except OSError as error:
                 raise self._parted(error.strerror or str(error)) from None
+        self._unsent = bytes(view)
+        if not view:
+            return True
+        now_us = self._clock.now_us()
+        if self._stuck_us is None:
+            self._stuck_us = now_us
+        elif now_us - self._stuck_us > _STUCK_S * 1e6:
+            raise self._parted(f"it read nothing for {_STUCK_S:g} s")
+        return False
 
     def recv(self, timeout_s: float = 0.0) -> bytes | None:
         """Return what has arrived, taking the next peer if there is none."""
         peer = self._present(timeout_s)
         if peer is None:
             return None
+        if self._unsent:
+            self._push(peer)
         try:
             if timeout_s >= _KERNEL_WAITS_S:
                 if timeout_s != self._limit_s:
@@ -142,6 +173,10 @@ class TcpLink(Link):
             raise self._parted(error.strerror or str(error)) from None
         if not data:
             raise self._parted("it closed the connection")
+        if self._unheard:
+            self._unheard = False
+            if data.startswith(_NO_MAVLINK):
+                raise self._parted("it spoke HTTP, as a browser does, and no MAVLink")
         return data
 
     def _limit(self, peer: socket.socket, timeout_s: float) -> None:
@@ -176,6 +211,7 @@ class TcpLink(Link):
             return None
         _at_once(peer)
         self._peer, self._limit_s = peer, 0.0
+        self._unsent, self._stuck_us, self._unheard = b"", None, True
         return peer
 
     def turn_away(self) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 from bridge.errors import LinkClosed, LinkUrlError, PortBusy
 from bridge.link import Link
 
-_LARGEST = 16_384
+_LARGEST = 4_096
 """Longest datagram that is read whole, bytes; nobody packs so many messages into one."""
 
 _STRANGERS_AT_ONCE = 64
@@ -78,7 +78,11 @@ class UdpLink(Link):
         url = f"udpout://{host}:{port}"
         family, remote = resolve(url, host, port, socket.SOCK_DGRAM)
         if local_port is None:
-            return cls(url, socket.socket(family, socket.SOCK_DGRAM), remote, open_port=False)
+            sock = socket.socket(family, socket.SOCK_DGRAM)
+            if _is_loopback(remote[0]):
+                # else the first datagram would open a port of every address, though only answers are read there
+                bind(url, sock, (remote[0], 0))
+            return cls(url, sock, remote, open_port=False)
         url = f"{url}?local={local_port}"
         if bind_host is not None:
             own = bind_host
