@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 import zlib
 from collections.abc import Callable, Iterator
@@ -58,10 +59,7 @@ def logged_flight(flight: Any, folder: Path) -> int:
 def test_a_flight_log(mavproxy: Console, logs: Path, flight: Any) -> None:
     pyulog = pytest.importorskip("pyulog")
     size = logged_flight(flight, logs)
-    mavproxy.say("log list")
-    # the vehicle writes one itself, from the start on
-    number = mavproxy.until(rf"Log (\d+)  numLogs [23] lastLog \d+ size {size} ")[1]
-    mavproxy.say(f"log download {number} flight.ulg")
+    mavproxy.say(f"log download {listed(mavproxy, size)} flight.ulg")
     mavproxy.until("Finished downloading flight.ulg", limit_s=90.0)
     path = mavproxy.folder / "flight.ulg"
     assert path.stat().st_size == size
@@ -83,6 +81,16 @@ def test_files(mavproxy: Console) -> None:
     written(folder / "param.pck", int(mavproxy.until(r"Wrote (\d+) bytes to param.pck")[1]))
     packed = param_ftp.ftp_param_decode((folder / "param.pck").read_bytes())
     assert {name.decode() for name, _, _ in packed.params} == set(specs)
+
+
+def listed(mavproxy: Console, size: int) -> int:
+    """Number of the log of that size; MAVProxy does not ask again for what the system dropped of a list."""
+    for _ in range(10):
+        mavproxy.say("log list")
+        # the vehicle writes one itself, from the start on
+        with contextlib.suppress(AssertionError):
+            return int(mavproxy.until(rf"Log (\d+)  numLogs [23] lastLog \d+ size {size} ", limit_s=5.0)[1])
+    raise AssertionError(f"no log of {size} bytes is listed")
 
 
 def written(path: Path, size: int) -> None:
