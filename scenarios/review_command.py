@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import sys
 from collections.abc import Callable, Sequence
@@ -163,10 +164,13 @@ def _look(choice: Choice, args: argparse.Namespace, tell: Tell) -> int:
             return _draw(whole, args, tell)
         if args.web:
             return _serve([whole], args, tell)
+        from scenarios.recorder import cursor
         from scenarios.recorder.viewer import open_viewer
 
         open_viewer([whole])
-    _print(f"Opened {recording}")
+        _print(f"Opened {recording}")
+        with contextlib.suppress(KeyboardInterrupt):  # whoever does not want to wait for that has what was asked for
+            cursor.put_when_loaded(whole)
     return EXIT_OK
 
 
@@ -204,8 +208,6 @@ def _draw(recording: Path, args: argparse.Namespace, tell: Tell) -> int:
 
 
 def _serve(recordings: Sequence[Path], args: argparse.Namespace, tell: Tell) -> int:
-    import contextlib
-
     from scenarios.recorder.web_viewer import PORT, WebViewer, viewer_page
 
     with WebViewer(recordings, PORT if args.port is None else args.port) as viewer:

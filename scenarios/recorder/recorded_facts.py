@@ -45,7 +45,7 @@ def recorded_facts(rrd: Path) -> RecordedFacts:
         FileError: it cannot be read.
     """
     try:
-        with whole_recording(rrd) as whole, _silence():
+        with whole_recording(rrd) as whole, silence():
             return _read(whole)
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
         raise _unreadable(rrd, error) from error
@@ -57,7 +57,7 @@ def recorded_facts(rrd: Path) -> RecordedFacts:
 
 
 @contextlib.contextmanager
-def _silence() -> Iterator[None]:
+def silence() -> Iterator[None]:
     """What Rerun's reader writes to the error output itself, a screen of it for a damaged file, goes nowhere."""
     try:
         kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)

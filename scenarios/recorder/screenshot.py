@@ -11,13 +11,10 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from scenarios.recorder.blueprints import BEFORE_S
+from scenarios.recorder.cursor import first_moment, put
 from scenarios.recorder.stream import TIMELINE
 from scenarios.recorder.viewer import headless
 from sitl.errors import FileError, UsageError
-
-INTO_S = 0.1
-"""Where a step is on its way."""
 
 _PAUSE_S = 0.3
 _LOAD_ATTEMPTS = 100
@@ -45,6 +42,7 @@ def screenshot(rrd: Path, png: Path, at_s: float | None = None, tab: str | None 
     """
     if not rrd.is_file():
         raise FileError(rrd, "no such recording", "Give a .rrd file of a run")
+    moment = first_moment(rrd)
     try:
         with headless() as viewer:
             viewer.open(str(rrd.resolve()))
@@ -55,8 +53,8 @@ def screenshot(rrd: Path, png: Path, at_s: float | None = None, tab: str | None 
                 _open_tab(viewer, tab)
             if at_s is not None:
                 viewer.set_time(TIMELINE, duration=at_s, play_state="paused")
-            else:
-                to_first_manoeuvre(viewer)
+            elif moment is not None:
+                put(viewer, moment)
             image = _still_frame(viewer)
             reports = [f"{view.name}: {report}" for view in viewer.get_state().views for report in view.reports]
     except (RuntimeError, OSError, ValueError) as error:
@@ -71,23 +69,6 @@ def screenshot(rrd: Path, png: Path, at_s: float | None = None, tab: str | None 
     except OSError as error:
         raise FileError(png, f"cannot be written: {error}", "Choose another file") from error
     return reports
-
-
-def to_first_manoeuvre(viewer: Any) -> None:
-    """Put the time cursor where the first manoeuvre has begun: a layout can select it, but not put the cursor there.
-
-    Args:
-        viewer: Rerun's `ViewerClient`, the recording loaded.
-    """
-    panels = (part.get("TimePanelBlueprint", {}) for part in viewer.get_blueprint().blueprint.values())
-    selections = [selection for panel in panels if (selection := panel.get("time_selection"))]
-    if selections:
-        start_s = _start_ns(selections[0]) * 1e-9 + BEFORE_S
-        viewer.set_time(TIMELINE, duration=start_s + INTO_S, play_state="paused")
-
-
-def _start_ns(selection: Any) -> int:
-    return int(selection["min"] if isinstance(selection, dict) else selection[0])
 
 
 def _wait_loaded(viewer: Any) -> None:

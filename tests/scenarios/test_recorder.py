@@ -11,7 +11,7 @@ import pytest
 from scenarios.limits import Outcome
 from scenarios.markdown import flight_page
 from scenarios.one_flight import fly
-from scenarios.recorder import FlightRecorder
+from scenarios.recorder import FlightRecorder, cursor, viewer
 from scenarios.recorder.blueprints import PALETTE, RANKS, candidate_colour, roll_range_deg
 from scenarios.recorder.body import enu_quaternions, rotor_radius
 from scenarios.recorder.comparison import best_flight, record_compare
@@ -225,7 +225,7 @@ class TestUnfinished:
     def test_a_killed_process_leaves_a_readable_file(self, tmp_path):
         program = f"""
 import numpy as np, os, pathlib, threading
-from scenarios.recorder import FlightRecorder
+from scenarios.recorder import FlightRecorder, cursor, viewer
 from scenarios.telemetry import Telemetry
 from scenarios.recorder.flight_drawing import FlownVehicle
 from sitl.airframe import load_airframe
@@ -470,6 +470,27 @@ def test_the_viewer_draws_the_comparison_without_complaint(flown_run, tmp_path, 
 def test_the_viewer_draws_every_page_of_a_flight_without_complaint(flight, tmp_path, tab):
     record(tmp_path / "a.rrd", flight).close(flight_page(flight), flight_properties(flight), "# Link")
     assert screenshot(tmp_path / "a.rrd", tmp_path / "page.png", tab=tab) == []
+
+
+@pytest.mark.skipif(ctypes.util.find_library("vulkan") is None, reason="no Vulkan driver: the viewer cannot draw")
+def test_the_viewer_is_told_where_the_cursor_starts(flight, tmp_path):
+    from rerun.experimental import ViewerClient
+
+    path = record(tmp_path / "a.rrd", flight).close()
+    assert cursor.first_moment(path) == (flight.gain_set.slug, pytest.approx(6.1))  # 0.1 s into the step
+    port = viewer.free_port()
+    with viewer.started("--headless", "--port", str(port), str(path)) as process:
+        viewer.wait_until_listening(process, port)
+        assert cursor.put_when_loaded(path, port)
+        (state,) = ViewerClient(f"rerun+http://{viewer.HOST}:{port}/proxy").get_state().recordings
+        assert state.current_time * 1e-9 == pytest.approx(cursor.first_moment(path)[1], abs=1e-3)
+
+
+def test_no_manoeuvre_no_cursor(tmp_path):
+    (tmp_path / "damaged.rrd").write_bytes(b"RRF2" + b"\xff" * 500)
+    for name in ("damaged.rrd", "none.rrd"):
+        assert cursor.first_moment(tmp_path / name) is None
+        assert not cursor.put_when_loaded(tmp_path / name)
 
 
 def test_a_screenshot_of_nothing_is_an_error_that_names_it(tmp_path):

@@ -21,7 +21,7 @@ import pytest
 
 from scenarios import cli
 from scenarios.limits import METRICS
-from scenarios.recorder import viewer
+from scenarios.recorder import cursor, viewer
 from scenarios.recorder.recorded_facts import recorded_facts
 from scenarios.recorder.recording_end import whole_bytes, whole_recording
 from scenarios.recorder.web_viewer import PAGE, WebViewer
@@ -111,6 +111,9 @@ class TestViewer:
     def _install(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.words = tmp_path / "words"
         monkeypatch.setattr(viewer, "viewer_path", lambda: fake(tmp_path, "exit 0"))
+        # somebody's own viewer may be there
+        self.told: list[Path] = []
+        monkeypatch.setattr(cursor, "put_when_loaded", self.told.append)
 
     def opened(self) -> list[str]:
         return self.words.read_text().splitlines()
@@ -120,6 +123,7 @@ class TestViewer:
         compare_rrd = runs / NEW / "compare.rrd"
         assert (status, out, err) == (0, f"Opened {compare_rrd}\n", [])
         assert self.opened() == ["--bind", "127.0.0.1", str(compare_rrd)]
+        assert self.told == [compare_rrd]
 
     @pytest.mark.parametrize(
         ("words", "recording"),
