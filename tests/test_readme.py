@@ -27,6 +27,9 @@ from scenarios.manoeuvres import KINDS, make_manoeuvre
 from scenarios.run_comparison import NEITHER, SENSES
 from scenarios.runner import RunOptions, run_scenario
 from scenarios.scenario import list_scenarios, load_scenario
+from scenarios.sweep.dataset import schema_of
+from scenarios.sweep.plan import make_plan
+from scenarios.sweep.sweep_file import load_sweep
 from scenarios.table import COLUMNS as TABLE
 from scenarios.table import cells
 from scenarios.telemetry import COLUMNS
@@ -291,6 +294,66 @@ def test_what_is_linked_or_named_exists(page: str) -> None:
             assert (base / link).exists(), link
     for path in re.findall(r"`((?:tests|sitl|bridge|scenarios|docs)/[\w./-]*)`", text):
         assert (ROOT / path).exists(), path
+
+
+# -- sweeps ----------------------------------------------------------------------------------------------------------
+
+
+def test_every_key_of_a_sweep_is_named(folder: Path) -> None:
+    text = FILES["my_sweep.toml"]
+    (folder / "wrong.toml").write_text(f"nonsense = 1\n{text}", encoding="utf-8")
+    with pytest.raises(FileError) as error:
+        load_sweep(folder / "wrong.toml")
+    known = re.search(r"Keys here are (.*)", str(error.value)).group(1).rstrip(".").split(", ")  # type: ignore[union-attr]
+    # a file has either of limit and limits, so only one of them is asked for
+    assert {row[0] for row in table("key of a sweep", "default")} == set(known) | {"limit"}
+    least = load_sweep(_written(folder / "least.toml", "[axes]\nMC_ROLL_P = [6.0, 7.0]\n"))
+    defaults = {row[0]: row[1].strip('"') for row in table("key of a sweep", "default")}
+    for name in ("setpoint_rate_hz", "required_pass_pct", "samples", "seed", "distribution", "spread_sigma"):
+        assert defaults[name] == (value if isinstance(value := getattr(least, name), str) else f"{value:g}"), name
+    assert (least.limits_name, least.design.kind) == (defaults["limits"], defaults["design"])
+
+
+def _written(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_the_columns_of_a_sweep_are_those_of_its_schema(folder: Path) -> None:
+    plan = make_plan(load_sweep(folder / "my_sweep.toml"))
+    parameters = {axis.name: "<parameter>" for axis in plan.sweep.parameters}
+    conditions = {"vehicle": "<condition>", **dict.fromkeys(plan.cases[0].conditions, "<condition>")}
+    metrics = "|".join(sorted(METRICS, key=len, reverse=True))
+    found: dict[str, set[str]] = {}
+    for field in schema_of(plan):
+        name = {**parameters, **conditions}.get(field.name, field.name)
+        name = re.sub(rf"^(failing_)?(?:{metrics})(?=_(?:nominal|worst|median|best|unset)$|$)", r"\1<metric>", name)
+        found.setdefault(name, set()).add(str(field.type))
+    rows = table("column of a sweep", "type")
+    assert [row[0] for row in rows] == list(found)
+    for name, types, *_ in rows:
+        assert found[name] <= set(re.findall(r"\w+", types)) - {"or"}, name
+
+
+def test_the_files_of_a_sweep(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = FILES["my_sweep.toml"].replace("points = 2000", "points = 24").replace("samples = 200", "samples = 2")
+    (folder / "my_sweep.toml").write_text(text, encoding="utf-8")
+    assert cli.main(["sweep", "my_sweep.toml", "--json"]) == cli.EXIT_OK
+    there = Path(json.loads(capsys.readouterr().out)["folder"])
+    promised = [re.sub(r"<\w+>", "*", name) for row in table("file of a sweep", "what") for name in row[0].split(", ")]
+    promised = [f"heat_*{name}" if name.startswith(".") else name for name in promised]
+    named = {path for name in promised for path in there.glob(name)}
+    assert {path for path in there.rglob("*.*") if path.name != ".lock"} <= named
+    kind = "best" if (there / "best.toml").exists() else "winner"
+    absent = {name for name in promised if not list(there.glob(name))}
+    assert absent == {
+        "flights/",
+        *(f"{name}.{end}" for name in {"best", "winner"} - {kind} for end in ("toml", "params")),
+    }
+    (script,) = (block for language, block in BLOCKS if language == "py" and "pyarrow" in block)
+    done = subprocess.run([sys.executable, "-c", script], cwd=there, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "pass_pct_min" in done.stdout
 
 
 # -- what was measured -----------------------------------------------------------------------------------------------

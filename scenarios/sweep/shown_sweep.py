@@ -40,15 +40,25 @@ def show_sweep(
     """
     ranking = rank(stored_sweep(path))
     front, flown = front_of(ranking), flown_beside(path)
-    made = [*write_winner(ranking, path), *_write_pictures(ranking, front, flown, path)]
+    made = [*write_winner(ranking, path), *write_pictures(ranking, front, flown, path)]
     files = {file.name: str(file) for file in made}
     if as_json:
         return ranking.passing, json.dumps(sweep_object(ranking, front, flown, files), indent=2) + "\n"
     return ranking.passing, sweep_text(ranking, front, flown, list(files), width=width, colour=colour)
 
 
-def _write_pictures(ranking: Ranking, front: Front, flown: FlownBeside | None, folder: Path) -> Sequence[Path]:
-    """Figures and page; pictures of an earlier look that are not drawn any more go."""
+def write_pictures(ranking: Ranking, front: Front, flown: FlownBeside | None, folder: Path) -> Sequence[Path]:
+    """Write figures, page and recording; pictures of an earlier look that are not drawn any more go.
+
+    Args:
+        ranking, front: of the sweep. flown: what was flown of it. folder: of the sweep.
+
+    Returns:
+        the files.
+
+    Raises:
+        FileError: something cannot be written.
+    """
     from scenarios.sweep.sweep_figures import heat_file, pareto_file
     from scenarios.sweep.sweep_maps import heat_maps
     from scenarios.sweep.sweep_report import sweep_page

@@ -108,7 +108,7 @@ def doubts(ranking: Ranking, flown: FlownBeside | None) -> list[str]:
         lines.append(f"The best candidate lies at the end of {', '.join(edges)}: a better one may lie beyond.")
     errors = sum(case.errors for case in ranking.cases)
     if errors:
-        lines.append(f"{many(errors, 'point')} could not be judged; {many(len(ranking.failures), 'reason')} below.")
+        lines.append(f"{many(errors, 'point')} could not be judged, most often because: {ranking.failures[0].text}")
     if flown is not None and flown.disagreements:
         lines.append(
             f"Batch and flight disagree about {len(flown.disagreements)} of {many(len(flown.flights), 'flight')}."
