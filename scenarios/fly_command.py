@@ -87,6 +87,7 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...] | None, seed: int 
     Returns:
         exit status.
     """
+    from bridge import exposure
     from scenarios import interrupts
     from scenarios.one_flight import MEMORY
     from scenarios.progress import RunWatch
@@ -112,6 +113,8 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...] | None, seed: int 
     os.environ.setdefault("RUST_LOG", "off")
 
     def begin() -> None:
+        for line in exposure.warnings(filter(None, (args.connect, args.hil)), exposure.FIRST):
+            tell(line)
         if options.live_port is not None:
             opened = "opening the viewer; one more" if options.live_window else "look on with"
             tell(f"live view: {opened}: rerun --connect rerun+http://127.0.0.1:{options.live_port}/proxy")

@@ -56,6 +56,7 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
     Returns:
         exit status: 0 done, 3 if the link or the autopilot failed.
     """
+    from bridge import exposure
     from bridge.sitl_links import check_instances
     from sitl.compiled import is_warm
     from sitl.errors import UsageError
@@ -73,6 +74,14 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
     if not is_warm():
         tell("compiling the control laws, once; up to half a minute ...")
     board = link.startswith("serial")
+    # what is served says itself who else can reach it
+    asked = [link] * args.check + [_connect_url(args)] * (args.check or args.setup) * (not board)
+    reached = "whoever speaks there reaches the board" + (", and may arm it" if args.arm_hardware else "")
+    for line in (
+        *exposure.warnings(asked, exposure.FIRST),
+        *exposure.warnings((args.ground or ()) if board else (), reached),
+    ):
+        tell(line)
     if args.check or (args.setup and board):
         status = _with_autopilot(args, link, model, profile, seed, tell)
         if args.check or status != EXIT_OK:

@@ -43,6 +43,7 @@ def run(args: argparse.Namespace, *, tell: Callable[[str], object]) -> int:
     Returns:
         exit status: 0 done or nothing pending, 2 a file that cannot be used, 3 the link or the vehicle.
     """
+    from bridge import exposure
     from scenarios import interrupts
     from scenarios.param_journal import state_folder
     from scenarios.progress import spinner
@@ -62,6 +63,8 @@ def run(args: argparse.Namespace, *, tell: Callable[[str], object]) -> int:
         elif not problems:
             _print(f"Nothing is pending: no journal in {state_folder()}.")
         return status
+    for line in exposure.warnings((task.url for task in tasks), exposure.FIRST):
+        tell(line)
     done: list[RestoreResult] = []
     with interrupts.caught(lambda: tell("stopping: what is not put back yet is kept")), spinner() as show:
         for result in restore(tasks, any_vehicle=args.yes_other_vehicle, show=show):
