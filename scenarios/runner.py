@@ -166,10 +166,8 @@ def _run_scenario(
     candidates = [plan(gain_set, scenario, model, profile) for gain_set in gain_sets]
     baseline = _baseline(gain_sets, scenario, model, profile)
     check_faults(scenario.faults, model, options.connect, plant=options.hil or str(options.px4 or ""))
-    folder = None
     started_utc = utc_stamp()
-    if options.out is not None:
-        folder = RunFolder.create(options.out, started_utc, scenario.name, model.name)
+    folder = None if options.out is None else RunFolder.create(options.out, started_utc, scenario.name, model.name)
     planned = [candidate for candidate in (*candidates, baseline) if candidate is not None]
     jobs = [
         replace(
