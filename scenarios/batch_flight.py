@@ -6,9 +6,8 @@ as `scenarios.score` has it for flights. NaN stands for UNSET.
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
 
@@ -16,28 +15,17 @@ import numpy as np
 import numpy.typing as npt
 
 from scenarios import batch_metrics as lanes
-from scenarios.batch_tracking import TRACK
+from scenarios.batch_metrics import MEASURED
 from scenarios.manoeuvres import EPSILON_S, Manoeuvre, Window
 from scenarios.metrics import effort_metrics, oscillation, step_metrics, track_metrics
 from sitl.array_form import array_form
-from sitl.batch import Batch, Block
-from sitl.compiled import compiled, select
+from sitl.batch import Batch, Block, IndexArray
 from sitl.profile import Profile
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
-MEASURED = (*lanes.STEP, *TRACK, *lanes.OSCILLATION, *lanes.EFFORT)
-"""Metrics of a pair, in the order of the rows of `WorstOf.values`."""
-
 _ROWS = {name: row for row, name in enumerate(MEASURED)}
-_STEP, _TRACK = slice(0, len(lanes.STEP)), slice(len(lanes.STEP), len(lanes.STEP) + len(TRACK))
-_SHAKE = slice(_TRACK.stop, _TRACK.stop + len(lanes.OSCILLATION))
-_EFFORT = slice(_SHAKE.stop, _SHAKE.stop + len(lanes.EFFORT))
-
-_HIGHEST, _LOWEST, _LARGEST, _KNOWN = range(4)
-_SENSE = {"vaf_pct": _LOWEST, "vaf_lag_removed_pct": _LOWEST, "droop_deg": _LARGEST, "oscillation_rad_s": _KNOWN}
-_SENSES = np.array([_SENSE.get(name, _HIGHEST) for name in MEASURED])
 
 
 def metrics_of(manoeuvres: Sequence[Manoeuvre]) -> tuple[str, ...]:
@@ -46,7 +34,7 @@ def metrics_of(manoeuvres: Sequence[Manoeuvre]) -> tuple[str, ...]:
     Args:
         manoeuvres: in any order.
     """
-    rows = {row for one in manoeuvres for window in one.windows for part in _rows_of(window.kind) for row in _span(part)}
+    rows = {row for one in manoeuvres for window in one.windows for row in _rows_of(window.kind)}
     return tuple(MEASURED[row] for row in sorted(rows))
 
 
@@ -60,31 +48,6 @@ def setpoint_ticks(manoeuvre: Manoeuvre, profile: Profile, setpoint_rate_hz: flo
     ticks = np.arange(round(manoeuvre.duration_s * profile.rate_hz))
     held = np.floor(ticks / profile.rate_hz * setpoint_rate_hz + EPSILON_S * setpoint_rate_hz).astype(int)
     return np.asarray(sent[np.minimum(held, len(sent) - 1)])
-
-
-@compiled
-def worse(sense: int, held: float, new: float) -> float:
-    """The worse of two windows' values; `held` is -inf before the first, and NaN is worse than any number.
-
-    The oscillation alone passes over a window that is too short to tell.
-    """
-    first, unknown = held == -math.inf, (new != new) | (held != held)
-    lowest = select(first, new, select(held < new, held, new))
-    highest = select(held > new, held, new)
-    largest = select(first | (abs(new) > abs(held)), new, held)
-    known = select(new != new, held, highest)
-    ordered = select(sense == _LOWEST, lowest, select(sense == _LARGEST, largest, highest))
-    return select(sense == _KNOWN, known, select(unknown, math.nan, ordered))
-
-
-@compiled
-def _merge(into: FloatArray, at: int, new: FloatArray, first: int, senses: npt.NDArray[np.int64]) -> None:
-    """Take the values of one window, (k, n), into rows `first` and on of all pairs', from column `at` on."""
-    rows, n = new.shape
-    for row in range(rows):
-        sense = senses[first + row]
-        for j in range(n):
-            into[first + row, at + j] = worse(sense, into[first + row, at + j], new[row, j])
 
 
 class WorstOf:
@@ -124,18 +87,25 @@ class WorstOf:
                 without.
             keep: called with every block while its traces are there.
         """
-        measure = _measure_lanes if batch.compiled else _measure_each
         signal = batch.job.phi_sp_rad
         self._measured.update(MEASURED.index(name) for name in metrics_of([manoeuvre]))
+        table = lanes.window_table(manoeuvre.windows, dt_s)
+        tracks = [_ticks(window, dt_s) for window in manoeuvre.windows if window.kind == "track"]
 
         def one(number: int, room: FloatArray) -> None:
             block = batch.fly(number, room)
             if keep is not None:
                 keep(block)
-            for at, part in _runs(block, self.shape[1]):
-                self.lost[at : at + len(part.lost)] |= part.lost
+            places = block.gain_set * self.shape[1] + block.sample
+            if not batch.compiled:
+                self.lost[places] |= block.lost
                 for window in manoeuvre.windows:
-                    measure(self.values, at, part, window, signal, dt_s)
+                    _measure_each(self.values, places, block, window, signal, dt_s)
+                return
+            lanes.measure_block(block.flown, table, dt_s, self.values, places, lanes.SENSES, block.lost, self.lost)
+            for ticks in tracks:
+                found = lanes.measure_track(block.flown[0, ticks], signal[ticks], dt_s)
+                lanes.merge_rows(found, lanes.TRACK_ROWS.start, self.values, places, lanes.SENSES)
 
         if pool is None:
             room = np.empty(batch.room)
@@ -162,7 +132,7 @@ class WorstOf:
 
     def metrics(self) -> dict[str, FloatArray]:
         """Name -> (G, S) of every metric that some window has measured; NaN is UNSET."""
-        cycles = lanes.is_limit_cycle(self.values[_SHAKE.start])
+        cycles = lanes.is_limit_cycle(self.values[lanes.SHAKE_ROWS.start])
         found = {}
         for row in sorted(self._measured):
             name, value = MEASURED[row], self.values[row]
@@ -173,50 +143,25 @@ class WorstOf:
         return found
 
 
-def _runs(block: Block, samples: int) -> list[tuple[int, Block]]:
-    """The block's pairs as stretches that follow one another: gain sets that fly together need not be neighbours."""
-    places = block.gain_set * samples + block.sample
-    first, last = int(places[0]), int(places[-1])
-    if last - first == len(places) - 1:
-        return [(first, block)]
-    cuts = [0, *(np.flatnonzero(np.diff(places) != 1) + 1).tolist(), len(places)]
-    made = []
-    for a, b in itertools.pairwise(cuts):
-        phi, p, delta = (np.ascontiguousarray(one[:, a:b]) for one in (block.phi_rad, block.p_rad_s, block.delta_lat))
-        made.append((int(places[a]), Block(block.gain_set[a:b], block.sample[a:b], phi, p, delta, block.lost[a:b])))
-    return made
-
-
-def _rows_of(kind: str) -> list[slice]:
+def _rows_of(kind: str) -> list[int]:
     """Rows of what a window of a kind measures."""
-    of_kind = {"step": [_STEP, _SHAKE], "track": [_TRACK], "hold": [_SHAKE]}
-    return [*of_kind.get(kind, []), _EFFORT]
+    of_kind = {
+        "step": [*lanes.STEP_ROWS, *lanes.SHAKE_ROWS],
+        "track": [*lanes.TRACK_ROWS],
+        "hold": [*lanes.SHAKE_ROWS],
+    }
+    return [*of_kind[kind], *lanes.EFFORT_ROWS]
 
 
-def _span(rows: slice) -> range:
-    return range(rows.start, rows.stop)
-
-
-def _rows(window: Window, dt_s: float) -> slice:
+def _ticks(window: Window, dt_s: float) -> slice:
     return slice(round(window.start_s / dt_s), round(window.end_s / dt_s))
 
 
-def _measure_lanes(values: FloatArray, at: int, block: Block, window: Window, signal: FloatArray, dt_s: float) -> None:
-    rows = _rows(window, dt_s)
-    phi = block.phi_rad[rows]
-    if window.kind == "step":
-        found = lanes.measure_step(phi, dt_s, window.phi_from_rad, window.phi_to_rad)
-        _merge(values, at, found, _STEP.start, _SENSES)
-    elif window.kind == "track":
-        _merge(values, at, lanes.measure_track(phi, signal[rows], dt_s), _TRACK.start, _SENSES)
-    if window.kind in ("step", "hold"):
-        _merge(values, at, lanes.measure_oscillation(block.p_rad_s[rows], dt_s)[None, :], _SHAKE.start, _SENSES)
-    _merge(values, at, lanes.measure_effort(block.delta_lat[rows]), _EFFORT.start, _SENSES)
-
-
-def _measure_each(values: FloatArray, at: int, block: Block, window: Window, signal: FloatArray, dt_s: float) -> None:
-    """The same by `scenarios.metrics`, one flight after the other: nothing to compile."""
-    rows = _rows(window, dt_s)
+def _measure_each(
+    values: FloatArray, places: IndexArray, block: Block, window: Window, signal: FloatArray, dt_s: float
+) -> None:
+    """A window by `scenarios.metrics`, one flight after the other: nothing to compile."""
+    rows = _ticks(window, dt_s)
     t = np.arange(rows.start, rows.stop) * dt_s
     start, end = window.start_s, window.end_s
     level = np.zeros(len(t))
@@ -235,11 +180,7 @@ def _measure_each(values: FloatArray, at: int, block: Block, window: Window, sig
         if window.kind in ("step", "hold"):
             shake = oscillation(t, block.p_rad_s[rows, j], level, level, start_s=start, end_s=end)
             found.setdefault("oscillation_rad_s", np.full(len(block.lost), math.nan))[j] = shake.worst_rad_s
-    _merge_arrays(values, at, found)
-
-
-def _merge_arrays(values: FloatArray, at: int, found: Mapping[str, FloatArray]) -> None:
-    law = array_form(worse)
+    law = array_form(lanes.worse)
     for name, new in found.items():
-        held = values[_ROWS[name], at : at + len(new)]
-        held[:] = law(int(_SENSES[_ROWS[name]]), held, new)
+        at = _ROWS[name]
+        values[at, places] = law(int(lanes.SENSES[at]), values[at, places], new)

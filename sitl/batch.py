@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from sitl.actuators import ACHIEVED, FLT_EPSILON
 from sitl.airframe import DERIVATIVE_NAMES
-from sitl.array_form import array_form
+from sitl.array_batch import ARRAY_WIDTH, fly_arrays
 from sitl.compiled import Record, compiled, is_compiled, select
 from sitl.errors import UsageError
 from sitl.filters import biquad_step, constrain
@@ -86,16 +86,29 @@ class Block:
 
     Attributes:
         gain_set, sample: (n,) number of each.
-        phi_rad, p_rad_s, delta_lat: (T, n) at every tick: before the tick's motion, and the torque of its commands.
+        flown: (3, T, lanes) of phi_rad, p_rad_s and delta_lat; lanes beyond the first n are nobody's.
         lost: (n,) the roll angle passed 80 degrees; the rest of that sample is frozen.
     """
 
     gain_set: IndexArray
     sample: IndexArray
-    phi_rad: FloatArray
-    p_rad_s: FloatArray
-    delta_lat: FloatArray
+    flown: FloatArray
     lost: BoolArray
+
+    @property
+    def phi_rad(self) -> FloatArray:
+        """(T, n) rad at every tick, before the tick's motion."""
+        return self.flown[0, :, : len(self.sample)]
+
+    @property
+    def p_rad_s(self) -> FloatArray:
+        """(T, n) rad/s, likewise."""
+        return self.flown[1, :, : len(self.sample)]
+
+    @property
+    def delta_lat(self) -> FloatArray:
+        """(T, n) torque of the tick's commands."""
+        return self.flown[2, :, : len(self.sample)]
 
 
 @compiled
@@ -234,12 +247,13 @@ class Batch:
         if matrices is None:
             matrices = step_matrices(job.derivatives, job.motor_lag_s, float(job.settings["dt_s"][0]))
         self.matrices = matrices
+        self._by_sample = np.ascontiguousarray(np.moveaxis(matrices, 0, 2))
         self._gains = np.stack(
             [job.settings[name][:, 0] if job.settings[name].ndim > 1 else job.settings[name] for name in GAINS]
         )
         self.blocks: list[tuple[int, IndexArray, IndexArray]] = []
         self._torques: dict[int, RollTorque] = {}
-        width = LANES if self.compiled else _ARRAY_WIDTH
+        width = LANES if self.compiled else ARRAY_WIDTH
         samples = len(job.derivatives)
         for members in _alike(job.settings):
             first = int(members[0])
@@ -265,13 +279,16 @@ class Batch:
         job = self.job
         first, gain_set, sample = self.blocks[number]
         torque, count = self._torques[first], len(sample)
-        # the last block is filled up with its own last pair
-        lanes = np.minimum(np.arange(LANES if self.compiled else count), count - 1)
-        matrices = np.ascontiguousarray(np.moveaxis(self.matrices[sample[lanes]], 0, 2))
-        gains = np.ascontiguousarray(self._gains[:, gain_set[lanes]])
-        shape = 3, len(job.phi_sp_rad), len(lanes)
+        width = LANES if self.compiled else count
+        sets, samples = gain_set, sample
+        if count < width:
+            # the last block is filled up with its own last pair
+            lanes = np.minimum(np.arange(width), count - 1)
+            sets, samples = gain_set[lanes], sample[lanes]
+        matrices, gains = self._by_sample.take(samples, axis=2), self._gains.take(sets, axis=1)
+        shape = 3, len(job.phi_sp_rad), width
         out = np.empty(shape) if room is None or room.shape != shape else room
-        lost = np.zeros(len(lanes), dtype=bool)
+        lost = np.zeros(width, dtype=bool)
         settings = job.settings[first : first + 1]
         if self.compiled:
             fly_lanes(
@@ -279,8 +296,8 @@ class Batch:
                 torque.given, torque.delta, out, lost,
             )  # fmt: skip
         else:
-            _fly_arrays(settings[0], gains, matrices, job, torque, out, lost)
-        return Block(gain_set, sample, out[0, :, :count], out[1, :, :count], out[2, :, :count], lost[:count])
+            fly_arrays(settings[0], gains, matrices, job, torque, out, lost)
+        return Block(gain_set, sample, out, lost[:count])
 
 
 def _alike(settings: npt.NDArray[np.void]) -> list[IndexArray]:
@@ -294,62 +311,3 @@ def _alike(settings: npt.NDArray[np.void]) -> list[IndexArray]:
     for number, row in enumerate(rest):
         groups.setdefault(row.tobytes(), []).append(number)
     return [np.array(members) for members in groups.values()]
-
-
-_ARRAY_WIDTH = 1024
-
-
-def _fly_arrays(
-    s: Record,
-    gains: FloatArray,
-    matrices: FloatArray,
-    job: RollJob,
-    torque_of: RollTorque,
-    out: FloatArray,
-    lost: BoolArray,
-) -> None:
-    """`fly_lanes` with numpy: the order of things is the same, the laws are the same lines."""
-    law, excess, biquad_of = array_form(roll_law), array_form(gravity_excess), array_form(biquad_step)
-    phi_out, p_out, delta_out = out
-    n = out.shape[2]
-    x = np.zeros((4, n))
-    y, accel, delay0, delay1, integral, rate_sp = (np.zeros(n) for _ in range(6))
-    notch = np.zeros((2, 2, n))
-    positive = negative = np.zeros(n, dtype=bool)
-    table = np.linspace(-torque_of.most, torque_of.most, len(torque_of.given)) if not torque_of.clips else None
-    whole = int(s["attitude_late_ticks"])
-    part = float(s["attitude_late_ticks"]) - whole
-    fixed = (
-        *(float(c) for c in s["low_pass"]), float(s["dgyro_alpha"]), float(s["dt_s"]),
-        gains[0], float(s["rate_max"][0]), *gains[1:], float(s["int_lim"][0]),
-        bool(s["linear"]), bool(s["rate_sp_late"]),
-    )  # fmt: skip
-    level = np.zeros(n)
-    for t, wanted in enumerate(job.phi_sp_rad.tolist()):
-        phi_out[t], p_out[t] = x[2], x[1]
-        seen = phi_out[t - whole] if t >= whole else level
-        if part:
-            seen = (1.0 - part) * seen + part * (phi_out[t - whole - 1] if t > whole else level)
-        measured = x[1]
-        for i in range(int(s["notch_count"])):
-            measured, w = biquad_of(*s["notches"][i], notch[i, 0], notch[i, 1], measured)
-            notch[i, 1], notch[i, 0] = notch[i, 0], w
-        torque, y, accel, w, integral, rate_sp = law(
-            measured, seen, wanted, y, accel, delay0, delay1, integral, rate_sp, positive, negative, *fixed
-        )
-        delay1, delay0 = delay0, w
-        if table is None:
-            given = np.clip(torque, -torque_of.limit, torque_of.limit)
-            delta_out[t] = given
-        else:
-            given = np.interp(torque, table, torque_of.given)
-            delta_out[t] = np.interp(torque, table, torque_of.delta)
-        if s["limits"] and (t + 1) % int(s["status_ticks"]) == 0:
-            missing = torque - given
-            wanting = missing * missing >= ACHIEVED
-            positive, negative = wanting & (missing > FLT_EPSILON), wanting & (missing < -FLT_EPSILON)
-        u = delta_out[t - job.delay_ticks] if t >= job.delay_ticks else level
-        e = level if s["linear"] else excess(x[2])
-        moved = np.einsum("ikn,kn->in", matrices, np.stack([*x, u, e]))
-        lost |= ~(np.abs(moved[2]) <= LOST_RAD)
-        x = np.where(lost, x, moved)

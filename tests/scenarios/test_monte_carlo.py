@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from scenarios.batch_metrics import EFFORT, STEP, measure_effort, measure_oscillation, measure_step, measure_track
+from scenarios.batch_metrics import MEASURED, SENSES, STEP, measure_block, measure_track, window_table
 from scenarios.batch_tracking import TRACK
-from scenarios.manoeuvres import make_manoeuvre
+from scenarios.manoeuvres import Window, make_manoeuvre
 from scenarios.metrics import effort_metrics, oscillation, step_metrics, track_metrics
 from scenarios.monte_carlo import MonteCarlo, draw_samples, monte_carlo
 from scenarios.runner import RunOptions, run_scenario
 from scenarios.scenario import load_scenario
 from sitl.airframe import Derivatives
+from sitl.batch import LANES
 from sitl.errors import UsageError
 from sitl.profile import get_profile
 from sitl.sampled_loop import RollGains
@@ -59,10 +60,23 @@ class TestLaneMetrics:
             ]
         )  # fmt: skip
 
+    def measured(self, kind: str, phi: np.ndarray, before: float = 0.0, after: float = 0.0) -> dict[str, np.ndarray]:
+        """Of one window, the angles being the rates and the torques, too; the other lanes are nobody's."""
+        count = phi.shape[1]
+        flown = np.repeat(np.pad(phi, ((0, 0), (0, LANES - count)), "edge")[None], 3, axis=0)
+        windows = window_table([Window(kind, 0.0, len(phi) / self.RATE_HZ, before, after)], 1.0 / self.RATE_HZ)
+        values = np.full((len(MEASURED), count + 2), -math.inf)
+        places = np.arange(count)[::-1] + 1
+        lost, ever = np.arange(count) == 1, np.zeros(count + 2, dtype=bool)
+        measure_block(flown, windows, 1.0 / self.RATE_HZ, values, places, SENSES, lost, ever)
+        assert np.flatnonzero(ever).tolist() == places[lost].tolist()
+        assert (values[:, [0, -1]] == -math.inf).all()
+        return {name: row[places] for name, row in zip(MEASURED, values, strict=True) if row[1] != -math.inf}
+
     def test_step(self) -> None:
         phi, dt = self.lanes()[: 3 * self.RATE_HZ], 1.0 / self.RATE_HZ
         target = math.radians(10.0)
-        got = dict(zip(STEP, measure_step(phi, dt, 0.0, target), strict=True))
+        got = self.measured("step", phi, 0.0, target)
         t = np.arange(len(phi)) * dt
         for j in range(phi.shape[1]):
             wanted = step_metrics(t, phi[:, j], start_s=0.0, end_s=3.0, phi_from_rad=0.0, phi_to_rad=target)
@@ -71,12 +85,10 @@ class TestLaneMetrics:
                 assert got[one.name][j] == pytest.approx(value, rel=1e-9, abs=1e-9, nan_ok=True), (one.name, j)
 
     def test_step_down_from_an_angle(self) -> None:
-        phi, dt = math.radians(10.0) - self.lanes()[: 3 * self.RATE_HZ], 1.0 / self.RATE_HZ
-        got = dict(zip(STEP, measure_step(phi, dt, math.radians(10.0), 0.0), strict=True))
-        again = dict(
-            zip(STEP, measure_step(self.lanes()[: 3 * self.RATE_HZ], dt, 0.0, math.radians(10.0)), strict=True)
-        )
-        for name in STEP[:4]:
+        phi = self.lanes()[: 3 * self.RATE_HZ]
+        got = self.measured("step", math.radians(10.0) - phi, math.radians(10.0), 0.0)
+        again = self.measured("step", phi, 0.0, math.radians(10.0))
+        for name in STEP:
             assert got[name] == pytest.approx(again[name], nan_ok=True, abs=1e-9), name
 
     @pytest.mark.parametrize("held", [1, 5, 2000], ids=["every tick", "50 Hz", "hardly ever"])
@@ -100,13 +112,27 @@ class TestLaneMetrics:
         delta, dt = 3.0 * self.lanes(), 1.0 / self.RATE_HZ
         t, level = np.arange(len(delta)) * dt, np.zeros(len(delta))
         end = float(len(delta) * dt)
-        effort = dict(zip(EFFORT, measure_effort(delta), strict=True))
-        shake = measure_oscillation(delta, dt)
-        for j in range(delta.shape[1]):
-            for one in effort_metrics(t, delta[:, j], start_s=0.0, end_s=end):
-                assert effort[one.name][j] == pytest.approx(one.value, rel=1e-9)
-            wanted = oscillation(t, delta[:, j], level, level, start_s=0.0, end_s=end)
-            assert shake[j] == pytest.approx(wanted.worst_rad_s, rel=1e-6, abs=1e-9)
+        for kind in ("step", "hold", "track"):
+            got = self.measured(kind, delta, 0.0, 1.0)
+            assert ("oscillation_rad_s" in got) == (kind != "track")
+            for j in range(delta.shape[1]):
+                for one in effort_metrics(t, delta[:, j], start_s=0.0, end_s=end):
+                    assert got[one.name][j] == pytest.approx(one.value, rel=1e-9), (kind, one.name)
+                wanted = oscillation(t, delta[:, j], level, level, start_s=0.0, end_s=end)
+                if kind != "track":
+                    assert got["oscillation_rad_s"][j] == pytest.approx(wanted.worst_rad_s, rel=1e-6, abs=1e-9)
+
+    def test_a_rate_that_rests_far_from_nothing_loses_no_digits(self) -> None:
+        t = np.arange(3 * self.RATE_HZ) / self.RATE_HZ
+        rate = 500.0 + np.column_stack([1e-6 * np.sin(40.0 * t), np.zeros_like(t)])
+        got = self.measured("hold", rate)["oscillation_rad_s"]
+        assert got == pytest.approx([1e-6 / math.sqrt(2.0), 0.0], rel=0.05, abs=1e-12)
+
+    def test_windows_too_short_to_tell(self) -> None:
+        got = self.measured("step", self.lanes()[: self.RATE_HZ // 2], 0.0, math.radians(10.0))
+        assert np.isnan(got["droop_deg"]).all()
+        # passed over: another window may be long enough
+        assert "oscillation_rad_s" not in self.measured("hold", self.lanes()[: self.RATE_HZ])
 
 
 class TestWaysOfRunning:
