@@ -59,7 +59,8 @@ def write_pictures(ranking: Ranking, front: Front, flown: FlownBeside | None, fo
     Raises:
         FileError: something cannot be written.
     """
-    from scenarios.sweep.sweep_figures import heat_file, pareto_file
+    from scenarios.sweep.heat_figures import heat_file
+    from scenarios.sweep.sweep_figures import pareto_file
     from scenarios.sweep.sweep_maps import heat_maps
     from scenarios.sweep.sweep_report import sweep_page
 

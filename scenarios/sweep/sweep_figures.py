@@ -1,6 +1,6 @@
-"""Figures of a sweep: the Pareto front, and heat maps of what two parameters do together.
+"""The Pareto front of a sweep as a figure; what figures of a sweep share.
 
-Each is drawn twice: for the page in the page's own colours, and as files, SVG and PNG, on white.
+Each figure is drawn twice: for the page in the page's own colours, and as files, SVG and PNG, on white.
 """
 
 from __future__ import annotations
@@ -10,17 +10,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from scenarios.report.canvas import FONT, INK, SMALL, Drawing, Panel
+from scenarios.report.canvas import INK, SMALL, Drawing, Panel
 from scenarios.study.figure_style import finished, panels
 from scenarios.sweep.pareto import Front
 from scenarios.sweep.ranking import Ranking, value_of
-from scenarios.sweep.sweep_maps import COST, PASSED, SHARE, HeatMap, Side, kinds_of
-from scenarios.sweep.sweep_words import many, objective_heading, objective_title, shown, unit_of
+from scenarios.sweep.sweep_words import many, objective_title, unit_of
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -40,12 +38,9 @@ MOST_POINTS = 1200
 _LOG_SPAN = 30.0
 _AROUND = 0.8
 """Of the span of what passes: how far around it the axes show what does not."""
-_LEVELS = 20
-_MOST_NUMBERS = 120
-"""Cells of a map that have room for their number."""
-_TICKS = 12
-_MOST_LETTERS = 32
-"""Of all names below an axis, side by side."""
+_FEW = 500
+_TAIL_PCT = 0.5
+"""Of more than a few that pass, per cent at either end that need not be seen."""
 SHARE_TITLE = "models that pass in the worst case [%]"
 
 
@@ -71,7 +66,7 @@ def pareto_file(ranking: Ranking, front: Front) -> FigureFile:
     canvas, grid = panels(1, 1, 7.6, 5.2)
     axes = grid[0, 0]
     _draw_pareto(axes, ranking, front, PRINT)
-    made = finished(canvas, "pareto", _title(ranking, _verdict(ranking), 70), "", "")
+    made = finished(canvas, "pareto", title_of(ranking, _verdict(ranking), 70), "", "")
     return FigureFile("pareto", made.svg.encode(), made.png)
 
 
@@ -88,41 +83,12 @@ def pareto_drawing(ranking: Ranking, front: Front, figure: str) -> Drawing:
     return Drawing(svg, f"Candidates by {_axis_title(ranking, 0)} and {_axis_title(ranking, 1)}. {told}", told)
 
 
-def heat_file(ranking: Ranking, heat: HeatMap) -> FigureFile:
-    """A heat map on white: what passes, and how well what passes everywhere does.
+def title_of(ranking: Ranking, what: str, width: int) -> str:
+    """Of a figure, in lines that fit.
 
     Args:
-        ranking: of the sweep. heat: two of its parameters.
+        ranking: of the sweep. what: is shown. width: letters of a line.
     """
-    kinds = kinds_of(heat)
-    canvas, grid = panels(1, len(kinds), 5.4 * len(kinds), 4.6)
-    for axes, kind in zip(grid[0], kinds, strict=True):
-        mesh, label = _draw_heat(axes, ranking, heat, kind, PRINT)
-        canvas.colorbar(mesh, ax=axes, drawedges=False).ax.tick_params(labelsize=SMALL)
-        axes.set_title(textwrap.fill(label, 44), fontsize=FONT)
-    name = f"heat_{heat.x.axis.name}_{heat.y.axis.name}"
-    made = finished(canvas, name, _title(ranking, "every other parameter at its best", 34 * len(kinds)), "", "")
-    return FigureFile(name, made.svg.encode(), made.png)
-
-
-def heat_drawing(ranking: Ranking, heat: HeatMap, kind: str, figure: str) -> Drawing:
-    """One of the two for the page.
-
-    Args:
-        ranking: of the sweep. heat: two of its parameters. kind: one of `kinds_of`. figure: its name on the page.
-    """
-    width, height = 4.3, 3.5
-    panel = Panel(width, height, margins_in=(0.68, 0.78, 0.74, 0.1))
-    with panel.drawn() as (axes,):
-        mesh, label = _draw_heat(axes, ranking, heat, kind, PAGE)
-        box = axes.get_position()
-        place = panel.figure.add_axes((1 - 0.66 / width, box.y0, 0.14 / width, box.height))
-        panel.figure.colorbar(mesh, cax=place)
-        svg = panel.svg(figure)
-    return Drawing(svg, _heat_told(ranking, heat, kind), label)
-
-
-def _title(ranking: Ranking, what: str, width: int) -> str:
     return "\n".join([*textwrap.wrap(ranking.sweep.title, width), *textwrap.wrap(what, width)])
 
 
@@ -176,7 +142,15 @@ def candidate_ends(ranking: Ranking, front: Front) -> tuple[Ends, Ends]:
     keep = np.flatnonzero(ranking.everywhere & drawable)
     keep = keep if len(keep) else front.candidates[drawable[front.candidates]]
     x, y = axis_values(ranking, 0), axis_values(ranking, 1)
-    return ends_of(x, drawable, x[keep]), ends_of(y, drawable, y[keep])
+    on = front.candidates[drawable[front.candidates]]
+    ends = [ends_of(one, drawable, _kept(one[keep], one[on])) for one in (x, y)]
+    return ends[0], ends[1]
+
+
+def _kept(passing: FloatArray, front: FloatArray) -> FloatArray:
+    if len(passing) <= _FEW:
+        return passing
+    return np.concatenate([np.percentile(passing, [_TAIL_PCT, 100.0 - _TAIL_PCT]), front])
 
 
 def _draw_pareto(axes: Any, ranking: Ranking, front: Front, ink: Mapping[str, str]) -> str:
@@ -195,13 +169,12 @@ def _draw_pareto(axes: Any, ranking: Ranking, front: Front, ink: Mapping[str, st
             {"marker": "o", "s": 16, "color": ink["hue0"], "linewidths": 0},
         ),
     ]
-    left_out = []
     for label, which, look in kinds:
         numbers = np.flatnonzero(which)
         if not len(numbers):
             continue
         if len(numbers) > MOST_POINTS:
-            left_out.append(f"{MOST_POINTS:,} of {len(numbers):,} that {label.replace('s ', ' ', 1)}")
+            label += f" ({MOST_POINTS:,} of {len(numbers):,})"
             numbers = numbers[np.linspace(0, len(numbers) - 1, MOST_POINTS).astype(int)]
         axes.scatter(x[numbers], y[numbers], label=label, **look)
     on = front.candidates[drawable[front.candidates]]
@@ -235,7 +208,6 @@ def _draw_pareto(axes: Any, ranking: Ranking, front: Front, ink: Mapping[str, st
         axes.legend(ncols=4, frameon=False, fontsize=SMALL, handletextpad=0.4, columnspacing=1.2, **place)
     missing = int(np.count_nonzero(ranking.complete & ~drawable))
     told = [f"Each in its worst case. {many(len(front.candidates), 'candidate')} on the front"]
-    told += [f"drawn are {text}" for text in left_out]
     told += [f"{missing:,} have no value, or an infinite one, in some case and are not drawn"] if missing else []
     beyond = int(np.count_nonzero(drawable & ~inside))
     told += [f"{beyond:,} lie beyond the axes"] if beyond else []
@@ -297,98 +269,16 @@ def ends_of(every: FloatArray, drawable: npt.NDArray[np.bool_], keep: FloatArray
 def _scale(axis: Any, limits: Any, ends: Ends) -> None:
     if ends.log:
         axis._set_axes_scale("log")
-        _log_ticks(axis)
+        log_ticks(axis)
     limits(ends.low, ends.high)
 
 
-def _log_ticks(axis: Any) -> None:
+def log_ticks(axis: Any) -> None:
+    """Ticks at 1, 2 and 5 with plain numbers.
+
+    Args:
+        axis: of matplotlib.
+    """
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
-
-
-# -- heat maps -------------------------------------------------------------------------------------------------------
-
-
-def _draw_heat(axes: Any, ranking: Ranking, heat: HeatMap, kind: str, ink: Mapping[str, str]) -> tuple[Any, str]:
-    """Draw; gives what the colour bar needs, and what is shown. Bright is good always."""
-    values, ends, colours = heat.share_pct, (0.0, 100.0), "cividis"
-    label = f"{SHARE_TITLE}, of each cell's best candidate"
-    levels = _LEVELS
-    if kind == PASSED:
-        cases = len(ranking.sweep.cases)
-        values, ends = heat.passed, (-0.5, cases + 0.5)
-        label = f"cases passed, of {cases}, by each cell's best candidate"
-        levels = min(cases + 1, _LEVELS)
-    elif kind == COST:
-        one = ranking.sweep.objectives[0]
-        values = np.asarray(value_of(one, heat.cost) * unit_of(one.metric)[1])
-        colours = "cividis" if one.maximise else "cividis_r"
-        known = values[np.isfinite(values)]
-        ends = (float(known.min()), float(known.max()))
-        if ends[0] == ends[1]:
-            ends = (ends[0] - 0.5 * abs(ends[0]) - 1e-9, ends[1] + 0.5 * abs(ends[1]) + 1e-9)
-        label = f"{objective_title(one)} in the worst case, the best that passes everywhere; hatched: none does"
-    axes.grid(False)
-    axes.patch.set(hatch="////", edgecolor=ink["rule"], linewidth=0.0)
-    table = mpl.colormaps[colours].resampled(levels)
-    mesh = axes.pcolormesh(
-        heat.x.edges, heat.y.edges, np.ma.masked_invalid(values), cmap=table, vmin=ends[0], vmax=ends[1],
-        edgecolors="face", linewidth=0.2,
-    )  # fmt: skip
-    _side(axes.xaxis, axes.set_xscale, heat.x)
-    _side(axes.yaxis, axes.set_yscale, heat.y)
-    axes.set_xlim(heat.x.edges[0], heat.x.edges[-1])
-    axes.set_ylim(heat.y.edges[0], heat.y.edges[-1])
-    if values.size <= _MOST_NUMBERS and heat.x.names and heat.y.names and heat.x.cells <= 12:
-        for row, column in np.argwhere(np.isfinite(values)).tolist():
-            value = float(values[row, column])
-            red, green, blue, _ = table((value - ends[0]) / (ends[1] - ends[0]))
-            dark = 0.299 * red + 0.587 * green + 0.114 * blue < 0.5
-            text = shown(float(f"{value:.3g}")) if kind == COST else f"{value:.0f}"
-            style = {"color": "#ffffff" if dark else "#000000", "fontsize": 7.0, "ha": "center", "va": "center"}
-            axes.text(column, row, text, **style)
-    best = ranking.best
-    if best is not None:
-        places = [_place(side, best, ranking) for side in (heat.x, heat.y)]
-        ring = {"marker": "o", "markersize": 19.0, "markerfacecolor": "none", "linestyle": "none", "clip_on": False}
-        axes.plot(*places, markeredgecolor="#ffffff", markeredgewidth=3.4, **ring)
-        axes.plot(*places, markeredgecolor="#d55e00", markeredgewidth=1.6, **ring)
-    axes.tick_params(length=2.5)
-    return mesh, label
-
-
-def _place(side: Side, candidate: int, ranking: Ranking) -> float:
-    return float(side.of[candidate]) if side.names else float(ranking.values[side.axis.name][candidate])
-
-
-def _side(axis: Any, set_scale: Any, side: Side) -> None:
-    from sitl.parameters import parameter_specs
-
-    unit = parameter_specs()[side.axis.name].unit
-    axis.set_label_text(f"{side.axis.name} [{unit}]" if unit else side.axis.name)
-    if side.names:
-        step = -(-side.cells // _TICKS)
-        names = [side.names[k] for k in range(0, side.cells, step)]
-        long = axis.axis_name == "x" and sum(len(name) for name in names) > _MOST_LETTERS
-        slant = {"rotation": 40.0, "ha": "right", "rotation_mode": "anchor"} if long else {}
-        axis.set_ticks(range(0, side.cells, step), names, **slant)
-        return
-    if side.axis.log and side.edges[0] > 0.0:
-        set_scale("log")
-        _log_ticks(axis)
-
-
-def _heat_told(ranking: Ranking, heat: HeatMap, kind: str) -> str:
-    names = f"{heat.x.axis.name} and {heat.y.axis.name}"
-    passing = int(np.count_nonzero(np.isfinite(heat.cost)))
-    where = f"in {passing} of {many(int(np.count_nonzero(heat.counts)), 'cell')} a candidate passes everywhere"
-    if kind == COST:
-        one = ranking.sweep.objectives[0]
-        return f"Heat map over {names}: the best {objective_heading(one)} of what passes everywhere; {where}."
-    what, values, unit = "cases passed", heat.passed, f"of {len(ranking.sweep.cases)}"
-    if kind == SHARE:
-        what, values, unit = "share of the models that pass in the worst case", heat.share_pct, "%"
-    known = values[np.isfinite(values)]
-    span = f", from {known.min():.0f} to {known.max():.0f} {unit}" if len(known) else ""
-    return f"Heat map over {names}: {what}, of the best candidate of each cell{span}; {where}."

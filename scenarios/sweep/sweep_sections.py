@@ -10,10 +10,11 @@ from scenarios.report.elements import UNSET, Cell, Figure, Line, Section, Table
 from scenarios.sweep.dataset import Dataset
 from scenarios.sweep.evaluation import ERROR
 from scenarios.sweep.flown_beside import FlownBeside, autopilot
+from scenarios.sweep.heat_figures import heat_drawing
 from scenarios.sweep.pareto import Front
 from scenarios.sweep.ranking import Ranking
 from scenarios.sweep.stored_sweep import StoredSweep
-from scenarios.sweep.sweep_figures import heat_drawing, pareto_drawing
+from scenarios.sweep.sweep_figures import pareto_drawing
 from scenarios.sweep.sweep_maps import HeatMap, influences, kinds_of
 from scenarios.sweep.sweep_text import most_failing, reason_lines, worst_text
 from scenarios.sweep.sweep_words import limit_title, many, objective_heading, objective_title, shown, shown_objective
