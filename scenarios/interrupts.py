@@ -79,12 +79,16 @@ def landing() -> Iterator[None]:
 
 
 @contextmanager
-def kept_from_children() -> Iterator[None]:
-    """Processes started in this block never see Ctrl-C: their parent hears it, too, and decides."""
+def kept_from_children(*others: int) -> Iterator[None]:
+    """Processes started in this block never see Ctrl-C: their parent hears it, too, and decides.
+
+    Args:
+        others: signals that are kept from them as well.
+    """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, *others})
     try:
         yield
     finally:

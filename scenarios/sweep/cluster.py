@@ -23,9 +23,8 @@ from typing import Any
 from uuid import uuid4
 
 from bridge.clock import WallClock
-from scenarios import interrupts
 from scenarios.sweep.cluster_check import CONNECT_S, check_workers, differs, scheduler_answers
-from scenarios.sweep.engines import DIED_TWICE, Result, Rows
+from scenarios.sweep.engines import DIED_TWICE, Result, Rows, apart
 from scenarios.sweep.evaluation import Columns, Evaluator, Task, failed
 from scenarios.sweep.plan import Plan
 from scenarios.sweep.program import program_facts
@@ -257,7 +256,7 @@ def _local_cluster(workers: int) -> Iterator[Any]:
     """Worker processes below this one, for as long as this lasts."""
     from distributed import LocalCluster
 
-    with interrupts.kept_from_children():  # the threads that will start others are started here, too
+    with apart():  # the threads that will start others are started here, too
         cluster = LocalCluster(
             n_workers=workers,
             threads_per_worker=1,

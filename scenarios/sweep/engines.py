@@ -7,13 +7,15 @@ result is the same whoever worked it out.
 from __future__ import annotations
 
 import os
+import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import count
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context, parent_process, resource_tracker
 from typing import Any, Protocol
 
 from scenarios import interrupts
@@ -94,6 +96,17 @@ class InProcess:
             yield Result(task, self._evaluator.rows(task))
 
 
+@contextmanager
+def apart() -> Iterator[None]:
+    """Workers started in this block hear neither Ctrl-C nor that the terminal has gone: we do, and end them."""
+    others = (signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()
+    with interrupts.kept_from_children(*others):
+        # Python's own helper is one of them. Starting it opens our ears again, so it is started first.
+        resource_tracker.ensure_running()
+    with interrupts.kept_from_children(*others):
+        yield
+
+
 _evaluator: Rows | None = None
 _begun: Any = None
 
@@ -160,7 +173,8 @@ class Processes:
         self._lost = self._stillborn = 0
 
     def __enter__(self) -> Processes:
-        self._places = [_Worker(self._plan, self._make) for _ in range(self.workers)]
+        with apart():
+            self._places = [_Worker(self._plan, self._make) for _ in range(self.workers)]
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -212,7 +226,7 @@ class Processes:
                 return
             worker = self._places[place]
             try:
-                with interrupts.kept_from_children():
+                with apart():
                     future = worker.executor.submit(_work, task)
             except BrokenProcessPool:
                 # it died with nothing to do, or what it had is told of in a moment
