@@ -220,7 +220,9 @@ class Lockstep:
 
     def _lost(self, lost: PeerLost) -> None:
         if not self.simulator.system:
-            self._once("a program came to the simulator's port and left without a HEARTBEAT: no PX4; waiting for one")
+            self._once(
+                f"a program came to the simulator's port without a HEARTBEAT ({lost.why}): no PX4; waiting for one"
+            )
             self.simulator.new_peer()
             return
         flying = self.armed
