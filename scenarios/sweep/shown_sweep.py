@@ -13,14 +13,13 @@ from scenarios.sweep.pareto import Front, front_of
 from scenarios.sweep.ranking import Ranking, rank
 from scenarios.sweep.stored_sweep import stored_sweep
 from scenarios.sweep.sweep_object import sweep_object
-from scenarios.sweep.sweep_text import sweep_text
+from scenarios.sweep.sweep_text import RECORDING, sweep_text
 from scenarios.sweep.winner import write_winner
 
 if TYPE_CHECKING:
     from scenarios.sweep.sweep_figures import FigureFile
 
 REPORT = "report.html"
-RECORDING = "sweep.rrd"
 
 
 def show_sweep(

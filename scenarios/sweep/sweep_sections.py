@@ -64,9 +64,7 @@ def maps_section(ranking: Ranking, maps: Sequence[HeatMap]) -> Section | None:
         "stretches explain by themselves of how candidates differ."
     ]
     rows = [Line(name, [Cell(f"{100.0 * share:.0f}")]) for name, share in matters.items()]
-    effect = Table(
-        "How much of the candidates' spread a parameter explains by itself", "parameter", ["share [%]"], rows
-    )
+    effect = Table("Influence of each parameter", "parameter", ["share of the spread [%]"], rows)
     return Section("parameters", "What the parameters do", lead if figures else (), grid=figures, tables=[effect])
 
 

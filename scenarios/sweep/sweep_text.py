@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import shlex
 import textwrap
 from collections.abc import Sequence
 from typing import Any
@@ -13,10 +14,11 @@ from scenarios.sweep.ranking import CaseSummary, Ranking, Reason
 from scenarios.sweep.sweep_maps import influences
 from scenarios.sweep.sweep_words import limit_title, many, objective_heading, objective_title, shown_objective
 from scenarios.sweep.winner import worst_case_name
-from scenarios.table import MINIMUM_WIDTH, PIPED_WIDTH, UNSET, number, text_console
+from scenarios.table import MINIMUM_WIDTH, PIPED_WIDTH, UNSET, number, text_console, viewer_command
 
 ROWS = 10
 """Candidates of the table for people."""
+RECORDING = "sweep.rrd"
 MOST_CASES = 40
 REASONS = 5
 _FIXED_WIDTH = 4 + 6 + 6 + 21 + 5 + 5 * 2
@@ -209,7 +211,10 @@ def sweep_text(
     if files:
         drawn = sum(name.endswith(".png") for name in files)
         named = [name for name in files if not name.endswith((".svg", ".png"))]
-        tell(f"Written there: {', '.join(named)}; {many(drawn, 'picture')} (pareto and heat maps, .svg and .png)")
+        tell(f"Written there: {', '.join(named)}; {many(drawn, 'picture')} (.svg and .png)")
+    if RECORDING in files:
+        recording = shlex.quote(str(ranking.sweep.path / RECORDING))
+        console.print(f"Look at it: {viewer_command()} {recording}", soft_wrap=True)
     return "\n".join(line.rstrip() for line in sink.getvalue().splitlines()) + "\n"
 
 
