@@ -249,6 +249,9 @@ def _track(keys: _Keys) -> list[Part]:
     ]
 
 
+RECORDED = "recorded"
+"""Kind of a manoeuvre that was found in a recorded flight; none of `KINDS`, which can be planned."""
+
 KINDS: Mapping[str, Callable[[_Keys], list[Part]]] = {
     "step": _step,
     "doublet": _doublet,

@@ -14,7 +14,7 @@ from scenarios.flight_import.loop_parameters import UNKNOWN, Group
 from scenarios.flight_import.recorded import Recorded
 from scenarios.flight_import.series import FloatArray
 from scenarios.flight_import.step_finder import LEVEL_RAD, Found
-from scenarios.manoeuvres import Manoeuvre, Window
+from scenarios.manoeuvres import RECORDED, Manoeuvre, Window
 
 if TYPE_CHECKING:
     from scenarios.flight_job import FlightJob
@@ -73,7 +73,7 @@ def replayed(recorded: Recorded, found: Found, group: Group, rate_hz: float) -> 
         )
         duration_s = windows[-1].end_s
         part = _part(recorded, begin_s, lead_s, duration_s, first.phi_from_rad)
-        made.append(Manoeuvre(name, "recorded", (part,), windows))
+        made.append(Manoeuvre(name, RECORDED, (part,), windows))
     return tuple(made)
 
 

@@ -177,7 +177,10 @@ def _computed(
     curves = {key: loop_curves(flown, one) for key, one in sets.items()}
     uncertain = any(flown.model.sigma_pct.as_dict().values())
     if not (sets and uncertain and flown.manoeuvres):
-        return {key: Computed(curves[key]) for key in sets}
+        problem = (
+            "" if flown.manoeuvres else "the manoeuvres were recorded, not planned, so no other model can fly them"
+        )
+        return {key: Computed(curves[key], problem=problem) for key in sets}
     try:
         many = monte_carlo(
             flown.model,

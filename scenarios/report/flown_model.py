@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from scenarios.manoeuvres import Manoeuvre, make_manoeuvre
+from scenarios.manoeuvres import RECORDED, Manoeuvre, make_manoeuvre
 from scenarios.roll_set import RollSet, roll_set
 from sitl.airframe import Airframe, Assumptions, Derivatives, Rotor
 from sitl.errors import FileError
@@ -111,6 +111,9 @@ def _profile(rows: Sequence[Mapping[str, Any]]) -> Profile:
 
 
 def _manoeuvres(scenario: Mapping[str, Any]) -> tuple[Manoeuvre, ...]:
+    """None where they were recorded elsewhere: nothing says how to fly them again."""
+    if any(one["kind"] == RECORDED for one in scenario["manoeuvres"]):
+        return ()
     rate_hz = float(scenario["setpoint_rate_hz"] or 50.0)
     made = []
     for one in scenario["manoeuvres"]:

@@ -18,7 +18,7 @@ from scenarios.report.flight_figures import (
     track_figure,
     track_id,
 )
-from scenarios.report.verdict import limits_of, title
+from scenarios.report.verdict import is_recorded, limits_of, title
 from scenarios.report.windows import MARKED, StepTrace, segments_of, step_trace, track_trace
 from sitl.errors import FroudeError
 
@@ -210,10 +210,13 @@ def _figure(name: str, one: Set, drawing: Drawing, caption: str = "") -> Figure:
 
 def parameters_section(sets: Sets) -> Section:
     """What each flight set, beside what the vehicle had before it."""
+    recorded = is_recorded(sets.run.data)
     had: dict[int, Mapping[str, float]] = {}
     notes = []
     for one in sets.all:
         file = one.flight.files.get("backup.params")
+        if file is None and recorded:
+            continue
         if file is None:
             notes.append(f"{one.name}: what the vehicle had before is not on disk (no backup of its parameters)")
             continue
@@ -244,6 +247,9 @@ def parameters_section(sets: Sets) -> Section:
         ["vehicle had", *(one.name for one in sets.all)],
         rows,
     )
+    if recorded:
+        lead = ["As the log has them. What the vehicle had before is not known: nothing was uploaded for this flight."]
+        return Section("parameters", "Parameters", lead, tables=[table], notes=notes)
     lead = ["After its flight the vehicle got back what it had before (<gain set>.backup.params in flights/)."]
     return Section("parameters", "Parameters beside the vehicle's backup", lead, tables=[table], notes=notes)
 
@@ -265,8 +271,14 @@ def twins_section(sets: Sets) -> Section | None:
     if not twins:
         return None
     agree = sum(twin["agree"] for twin in twins)
+    recorded = is_recorded(sets.run.data)
+    flew = (
+        "On the model our own autopilot flew the gains and set-points that were recorded"
+        if recorded
+        else "A real autopilot flew the plant, and our own flew the same again"
+    )
     lead = [
-        f"A real autopilot flew the plant, and our own flew the same again: they agree within what is tolerated for "
+        f"{flew}: they agree within what is tolerated for "
         f"{agree} of {len(twins)} gain set{'' if len(twins) == 1 else 's'}. A difference is the real one's minus ours."
     ]
     tables = []
@@ -279,7 +291,8 @@ def twins_section(sets: Sets) -> Section | None:
         agrees = "agree" if twin["agree"] else "differ"
         caption = f"{twin['gain_set']}: they {agrees}; verdict {twin['outcome']}, with our own {twin['own_outcome']}"
         tables.append(Table(caption, "quantity", ["real", "own", "difference", "tolerated", "within"], rows))
-    return Section("twins", "The real autopilot beside our own", lead, tables=tables, notes=list(_alone(twins)))
+    heading_ = "What was recorded beside our own autopilot" if recorded else "The real autopilot beside our own"
+    return Section("twins", heading_, lead, tables=tables, notes=list(_alone(twins)))
 
 
 def _quantity_name(one: Mapping[str, Any]) -> str:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from scenarios.limits import METRICS, MILLISECONDS, STANDING, TITLES, Limit
+from scenarios.manoeuvres import RECORDED
 from scenarios.table import number
 
 Object = Mapping[str, Any]
@@ -103,7 +104,7 @@ def verdict_of(data: Object, shares: Sequence[tuple[int, int] | None] = ()) -> V
         for one in passing
         if one.doubtful and one.share is not None
     ]
-    told, apart = _twins(data["twins"])
+    told, apart = _twins(data["twins"], recorded=is_recorded(data))
     ground = f"{ground} {told}".strip()
     doubts += apart
     if not data["complete"]:
@@ -134,8 +135,11 @@ def _headline(data: Object, judged: Sequence[Judged], passing: Sequence[Judged],
         return f"Do not trust these verdicts yet: the airframe's own flight gains do not fly here ({vehicle})."
     if not passing:
         open_ = sum(one.outcome == "UNSET" for one in judged)
+        if count == 1:
+            name = judged[0].name
+            return f"{name} on {vehicle} is not decided." if open_ else f"Do not trust {name} on {vehicle}."
         undecided = f"; {open_} not decided" if open_ else ""
-        return f"Trust none of the {count} gain set{_s(count)} on {vehicle}{undecided}."
+        return f"Trust none of the {count} gain sets on {vehicle}{undecided}."
     names = ", ".join(one.name for one in passing[:4]) + (f" and {len(passing) - 4} more" if len(passing) > 4 else "")
     if count == 1:
         return f"Trust {names} on {vehicle}."
@@ -172,14 +176,27 @@ def _ground(own: Object | None) -> tuple[str, str]:
     return f"{text}.", f"{text}: doubt the assumptions before the candidates"
 
 
-def _twins(twins: Sequence[Object]) -> tuple[str, list[str]]:
+def is_recorded(data: Object) -> bool:
+    """The flights were recorded elsewhere; our own autopilot flew beside them on a model, if one was named.
+
+    Args:
+        data: a `run.json` in the present schema.
+    """
+    return data["vehicle"].get("spec") == RECORDED or any(one["kind"] == RECORDED for one in data["scenario"]["manoeuvres"])
+
+
+def _twins(twins: Sequence[Object], *, recorded: bool) -> tuple[str, list[str]]:
     """That a real autopilot flew, and the doubts that follow."""
     if not twins:
         return "", []
     apart = [twin["gain_set"] for twin in twins if not twin["agree"]]
     agree = f"our own agrees with it in {len(twins) - len(apart)} of {len(twins)} flights"
-    doubt = f"The real autopilot and our own differ by more than is tolerated with {', '.join(apart)}"
-    return f"A real autopilot flew this plant; {agree}.", [doubt] if apart else []
+    real = "What was recorded and our own autopilot on the model" if recorded else "The real autopilot and our own"
+    doubt = f"{real} differ by more than is tolerated with {', '.join(apart)}"
+    if recorded:
+        agree = f"on the model our own autopilot agrees with it in {len(twins) - len(apart)} of {len(twins)} flights"
+    flew = "This was recorded elsewhere" if recorded else "A real autopilot flew this plant"
+    return f"{flew}; {agree}.", [doubt] if apart else []
 
 
 def limits_of(data: Object) -> dict[str, str]:

@@ -340,6 +340,8 @@ class TestVerdict:
             (("FAIL", "FAIL", "UNSET"), "Trust none of the 3 gain sets on ANT-X; 1 not decided."),
             (("INFO", "INFO", "INFO"), "Nothing was limited, so nothing is judged: 3 gain sets flown on ANT-X."),
             ((), "No gain set was flown, so there is nothing to trust."),
+            (("FAIL",), "Do not trust 2.2 ANT-X on ANT-X."),
+            (("UNSET",), "2.2 ANT-X on ANT-X is not decided."),
         ],
     )
     def test_headline(self, run, outcomes, headline):
@@ -347,6 +349,17 @@ class TestVerdict:
         for flight, outcome in zip(run["flights"], outcomes, strict=True):
             flight["outcome"] = outcome
         assert verdict_of(run).headline == headline
+
+    def test_what_was_recorded_elsewhere_is_called_so(self, run):
+        run["scenario"]["manoeuvres"] = [{"name": "step_1", "kind": "recorded", "duration_s": 6.0, "settings": {}}]
+        run["twins"] = [{"gain_set": "2.2 ANT-X", "agree": False}]
+        verdict = verdict_of(run)
+        assert verdict.ground.endswith("on the model our own autopilot agrees with it in 0 of 1 flights.")
+        assert verdict.doubts[0].startswith("What was recorded and our own autopilot on the model differ")
+        (done,) = compute(run, [run["flights"][0]["uploaded"]]).values()
+        assert done.curves is not None
+        assert done.samples is None
+        assert "recorded, not planned" in done.problem
 
     def test_interrupted_and_two_autopilots_apart(self, run):
         run["complete"] = False
