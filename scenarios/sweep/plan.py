@@ -17,6 +17,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from scenarios.gain_set import GainSet, check
 from scenarios.roll_set import roll_set
 from scenarios.scenario import beside
@@ -243,10 +246,24 @@ def _check_values(sweep: Sweep, cases: Sequence[Case]) -> list[str]:
     return list(dict.fromkeys(warnings))
 
 
+_PER_AXIS = ("att_gain", "rate_max", "int_lim", "k", "kp", "ki", "kd", "kff")
+_OF_YAW = ("yaw_weight", "yaw_torque_alpha")
+
+
+def _of_roll(settings: npt.NDArray[np.void]) -> bytes:
+    """Settings without what the other axes alone have."""
+    rest = settings.copy()
+    for name in _PER_AXIS:
+        rest[name][1:] = 0.0
+    for name in _OF_YAW:
+        rest[name] = 0.0
+    return bytes(rest.tobytes())
+
+
 def _acts(sweep: Sweep, case: Case, low: Mapping[str, float], high: Mapping[str, float]) -> bool:
     """Do two values of a parameter make two different loops?"""
     try:
         one, other = (roll_set(case.model, case.profile, {**sweep.fixed, **end}) for end in (low, high))
     except UsageError as error:
         raise UsageError(f"{sweep.path}: axes: {error}") from error
-    return one.settings.tobytes() != other.settings.tobytes() or one.profile != other.profile
+    return _of_roll(one.settings) != _of_roll(other.settings) or one.profile != other.profile
