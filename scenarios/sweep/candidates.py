@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +32,8 @@ class Candidates:
         self._axes = plan.sweep.parameters
         self._design = plan.sweep.design
         self._count = plan.candidates
+        self._engine: Any = None
+        self._at = 0
 
     def values(self, start: int, stop: int) -> FloatArray:
         """(n, D) values of candidates `start` to `stop`, a column an axis, as PX4 stores them.
@@ -49,13 +52,18 @@ class Candidates:
     def _sobol(self, start: int, stop: int) -> FloatArray:
         from scipy.stats import qmc
 
-        engine = qmc.Sobol(len(self._axes), scramble=True, rng=np.random.default_rng(self._design.seed))
-        if start:
-            engine.fast_forward(start)
+        # one stretch is mostly asked for after the other: to wind on from the beginning each time would take longer
+        # and longer
+        if self._engine is None or start < self._at:
+            rng = np.random.default_rng(self._design.seed)
+            self._engine, self._at = qmc.Sobol(len(self._axes), scramble=True, rng=rng), 0
+        if start > self._at:
+            self._engine.fast_forward(start - self._at)
+        self._at = stop
         with warnings.catch_warnings():
             # the balance of a power of two is lost, the points are as good as any other beginning of the sequence
             warnings.simplefilter("ignore", UserWarning)
-            return np.asarray(engine.random(stop - start))
+            return np.asarray(self._engine.random(stop - start))
 
     @cached_property
     def _latin(self) -> FloatArray:
