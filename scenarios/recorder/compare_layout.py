@@ -25,16 +25,14 @@ class ComparePage:
     spread: bool = False
 
 
-def compare_blueprint(pages: Sequence[ComparePage], best: str = "", *, twins: bool = False) -> Any:
+def compare_blueprint(pages: Sequence[ComparePage], verdict: str = "", *, twins: bool = False) -> Any:
     """A tab per manoeuvre with every candidate above the table, one of their spread, then the circumstances.
 
     Args:
-        pages: of the manoeuvres. best: name of the gain set that is best; empty if none passes.
+        pages: of the manoeuvres. verdict: in a few words, above the plots.
         twins: there is a document on two autopilots, `/twins`.
     """
     import rerun.blueprint as rrb
-
-    winner = f". Best: {best}" if best else ". None passes"
 
     def lower(name: str, quantity: str, prefix: str, page: Page, y: tuple[float, float] | None) -> Any:
         # The colours are those of the plot above, whose legend is enough.
@@ -46,7 +44,7 @@ def compare_blueprint(pages: Sequence[ComparePage], best: str = "", *, twins: bo
         tabs.append(
             rrb.Vertical(
                 series(
-                    f"{page.name}: roll angle [deg]{winner}",
+                    f"{page.name}: roll angle [deg]. {verdict}",
                     (*one.bands, f"{prefix}/roll/**"),
                     page,
                     page.roll_deg,

@@ -95,7 +95,10 @@ def record_compare(run: RunRecord, path: Path) -> Path:
     recording.properties({"run": _run_properties(run, best_name)})
     if run.twins:
         recording.document("/twins", twin_table.markdown(run.twins))
-    recording.layout(compare_blueprint(pages, best_name, twins=bool(run.twins)))
+    title = f"Best: {best_name}" if best_name else "None passes"
+    if len(run.flights) == 1:
+        title = f"{run.flights[0].gain_set.name}: {run.flights[0].outcome}"
+    recording.layout(compare_blueprint(pages, title, twins=bool(run.twins)))
     return recording.finish()
 
 
@@ -149,6 +152,8 @@ def _summary(run: RunRecord, ranks: Sequence[str], best: str) -> str:
     order = sorted(range(len(ranks)), key=lambda n: -list(RANKS).index(ranks[n]))
     ordered = dataclasses.replace(run, flights=tuple(run.flights[n] for n in order))
     head = f"## Best: {best}, of those that pass the closest to its set-point" if best else "## No gain set passes"
+    if len(ranks) == 1:
+        head = f"## {run.flights[0].gain_set.name}: {run.flights[0].outcome}"
     return f"{head}\n\n{markdown.verdicts(ordered)}\n{markdown.margins_and_gains(ordered.flights)}\n"
 
 
@@ -244,7 +249,7 @@ def _write_manoeuvre(
     _write_setpoint(recording, prefix, longest)
     for place, part in enumerate(parts, start=1):
         look = looks[part.number]
-        best = ", best" if part.rank == "best" and not part.own else ""
+        best = ", best" if part.rank == "best" and not part.own and len(looks) > 1 else ""
         who = ", own autopilot" if part.own else ""
         shared = f"{sum(one.name is None for one in looks)} sets that oscillate"
         name = f"{look.name or shared}{who}: {part.flight.outcome}{best}"

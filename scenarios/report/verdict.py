@@ -182,7 +182,8 @@ def is_recorded(data: Object) -> bool:
     Args:
         data: a `run.json` in the present schema.
     """
-    return data["vehicle"].get("spec") == RECORDED or any(one["kind"] == RECORDED for one in data["scenario"]["manoeuvres"])
+    kinds = [one["kind"] for one in data["scenario"]["manoeuvres"]]
+    return data["vehicle"].get("spec") == RECORDED or RECORDED in kinds
 
 
 def _twins(twins: Sequence[Object], *, recorded: bool) -> tuple[str, list[str]]:

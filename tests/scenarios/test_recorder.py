@@ -486,6 +486,15 @@ def test_the_viewer_is_told_where_the_cursor_starts(flight, tmp_path):
         assert state.current_time * 1e-9 == pytest.approx(cursor.first_moment(path)[1], abs=1e-3)
 
 
+def test_of_one_gain_set_nothing_is_best(flown_run, tmp_path):
+    run = dataclasses.replace(flown_run, flights=flown_run.flights[:1])
+    one = Read(record_compare(run, tmp_path / "compare.rrd"))
+    assert one.text("/summary").startswith("## own gains: PASS\n")
+    names = [one.column(entity, "SeriesLines:names")[1][0][0] for entity in one.chunks if "/roll/" in entity]
+    assert names
+    assert not any("best" in name for name in names)
+
+
 def test_no_manoeuvre_no_cursor(tmp_path):
     (tmp_path / "damaged.rrd").write_bytes(b"RRF2" + b"\xff" * 500)
     for name in ("damaged.rrd", "none.rrd"):
