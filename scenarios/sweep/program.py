@@ -9,7 +9,18 @@ from typing import Any
 
 from scenarios.versions import versions
 
-_PARTS = (("sitl", "*.py"), ("sitl", "*.toml"), ("scenarios", "*.py"), ("scenarios/sweep", "*.py"))
+_PARTS = (
+    ("sitl", ("*.py", "*.toml")),
+    (
+        "scenarios",
+        ("batch_*.py", "metrics.py", "monte_carlo.py", "roll_set.py", "limits.py", "manoeuvres.py", "analysis.py"),
+    ),
+    (
+        "scenarios/sweep",
+        ("axes.py", "candidates.py", "evaluation.py", "dataset.py", "objectives.py", "plan.py", "search.py"),
+    ),
+)
+"""Sources that a row depends on."""
 
 
 @cache
@@ -17,8 +28,8 @@ def program_digest() -> str:
     """Of the sources of the laws, the batch and the metrics: workers that differ in it may differ in the last bit."""
     root = Path(__file__).parents[2]
     digest = hashlib.sha256()
-    for folder, pattern in _PARTS:
-        for path in sorted((root / folder).glob(pattern)):
+    for folder, patterns in _PARTS:
+        for path in sorted(path for pattern in patterns for path in (root / folder).glob(pattern)):
             digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from scenarios.sweep.axes import ParameterAxis, as_stored
 from scenarios.sweep.evaluation import PASS
 from scenarios.sweep.plan import Plan
+from scenarios.sweep.ranking import cost
 from sitl.errors import FileError
 
 if TYPE_CHECKING:
@@ -55,8 +56,7 @@ class Search:
                 )
             else:
                 sampler = optuna.samplers.TPESampler(seed=seed, constraints_func=_constraint, constant_liar=True)
-            towards = optuna.study.StudyDirection
-            directions = [towards.MAXIMIZE if one.maximise else towards.MINIMIZE for one in objectives]
+            directions = [optuna.study.StudyDirection.MINIMIZE for _ in objectives]
             self._study = optuna.create_study(sampler=sampler, directions=directions)
         self._asked: list[Any] = []
         self._suggestions = {axis.name: _suggestion(axis) for axis in self._axes}
@@ -103,7 +103,7 @@ class Search:
         for k, trial in enumerate(self._asked):
             mine = at == k
             trial.set_user_attr(_SHORT, float(short[mine].max()))
-            told = [_worst(np.array(table[one.column], dtype=np.float64)[mine], one.maximise) for one in objectives]
+            told = [_worst(cost(one, np.array(table[one.column], dtype=np.float64)[mine])) for one in objectives]
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 self._study.tell(trial, told)
@@ -113,11 +113,9 @@ def _constraint(trial: Any) -> tuple[float]:
     return (float(trial.user_attrs.get(_SHORT, 100.0)),)
 
 
-def _worst(values: FloatArray, maximise: bool) -> float:
+def _worst(costs: FloatArray) -> float:
     """Over the cases; what could not be measured in one is worse than anything that was."""
-    bad = -1e9 if maximise else 1e9
-    known = np.nan_to_num(values, nan=bad, posinf=1e9, neginf=-1e9)
-    return float(known.min() if maximise else known.max())
+    return float(np.nan_to_num(costs, nan=1e9, posinf=1e9, neginf=-1e9).max())
 
 
 def _suggestion(axis: ParameterAxis) -> Any:
