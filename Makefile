@@ -12,12 +12,13 @@ PIP    := $(BIN)/python -m pip --disable-pip-version-check --no-input install --
 MADE   := $(VENV)/.made
 FLIES  := $(VENV)/.flies
 TESTS  := $(VENV)/.tests
+AUDIT  := $(VENV)/audit/bin/pip-audit
 
 # Packages of the system are installed by root only, and only when they are missing.
 APT     = DEBIAN_FRONTEND=noninteractive apt-get
 AS_ROOT = [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null
 
-.PHONY: help demo test bench lint install install-test vulkan chromium clean
+.PHONY: help demo test bench lint audit install install-test vulkan chromium clean
 .DELETE_ON_ERROR:
 
 help:
@@ -25,6 +26,7 @@ help:
 	@echo "make test    set up, then run all checks and tests"
 	@echo "make lint    set up, then run ruff, mypy and the import contracts only"
 	@echo "make bench   set up, then measure speed"
+	@echo "make audit   ask which of the versions in constraints.txt have known vulnerabilities"
 	@echo "make clean   remove $(VENV) and every cache; logs/ is kept"
 
 demo: $(FLIES)
@@ -48,6 +50,14 @@ lint: $(TESTS)
 
 bench: $(TESTS)
 	@$(BIN)/python -m pytest tests/bench -o python_files='bench_*.py' --capture=no --quiet
+
+# In an environment of its own, so that it changes nothing of what is tested. Fails, too, if nobody could be asked.
+audit: $(AUDIT)
+	@echo "==> asking for known vulnerabilities of the versions in constraints.txt"
+	@rm -f $(VENV)/audit.json
+	@$(AUDIT) --requirement constraints.txt --no-deps --disable-pip --progress-spinner off --timeout 20 \
+	  --format json --output $(VENV)/audit.json >$(VENV)/audit.log 2>&1 || true
+	@$(BIN)/python .ci/audit_result.py $(VENV)/audit.json $(VENV)/audit.log
 
 install: $(FLIES)
 
@@ -73,6 +83,12 @@ $(TESTS): $(FLIES)
 	@echo "==> installing what the tests need (MAVSDK, MAVProxy, mypy and others: 1 GB more, a quarter of a minute or more)"
 	@$(PIP) --editable '.[test]'
 	@touch $@
+
+$(AUDIT): $(MADE)
+	@echo "==> installing pip-audit"
+	@$(BIN)/python -m venv $(VENV)/audit
+	@$(VENV)/audit/bin/python -m pip --disable-pip-version-check --no-input install --quiet pip-audit || { \
+	  echo "pip-audit cannot be installed: is there a network, or a package index?" >&2; exit 2; }
 
 # The test of the recordings' pictures draws with a software Vulkan driver. Without one it is skipped, and says so.
 vulkan:
