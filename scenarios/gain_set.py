@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from scenarios.toml_file import read_toml
 from sitl.errors import FileError, UsageError
 from sitl.keyed_table import nearest
+from sitl.plain_file import check_plain
 
 if TYPE_CHECKING:
     from sitl.parameters import ParameterTable
@@ -303,11 +304,16 @@ def _set_from_table(entry: dict[str, Any], path: Path, number: int) -> GainSet:
 def _number(value: Any, path: Path, what: str) -> None:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise FileError(path, f"{what} = {value!r} is not a number", "Write a number without quotes")
-    if not math.isfinite(value):
+    try:
+        finite = math.isfinite(value)
+    except OverflowError:
+        raise FileError(path, f"{what} has {len(str(abs(value)))} digits", "Write a number") from None
+    if not finite:
         raise FileError(path, f"{what} = {value} is not a finite number", "Write a number")
 
 
 def _from_params(path: Path) -> GainSet:
+    check_plain(path)
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -327,6 +333,8 @@ def _from_params(path: Path) -> GainSet:
         if name in parameters:
             raise FileError(path, f"line {number}: {name} is given twice", "Remove one")
         try:
+            if not value.isascii() or "_" in value:  # Python's own liberties with numbers
+                raise ValueError
             if kind == "6":
                 parameters[name] = int(value)
             elif kind == "9":

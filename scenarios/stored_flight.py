@@ -10,6 +10,7 @@ Nothing here opens a big file unless it is asked for.
 from __future__ import annotations
 
 import json
+import mmap
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -252,9 +253,13 @@ def log_span_s(path: Path) -> tuple[float, float] | None:
         None if there is not one whole frame in it, or it cannot be read.
     """
     try:
-        data = path.read_bytes()
-    except OSError:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            return _span_s(data)
+    except (OSError, ValueError):  # there is nothing in an empty file to look at
         return None
+
+
+def _span_s(data: mmap.mmap) -> tuple[float, float] | None:
     first = last = None
     at = 0
     while at + 20 <= len(data):

@@ -18,9 +18,13 @@ import numpy.typing as npt
 
 from sitl.errors import FileError, UsageError
 from sitl.keyed_table import nearest
+from sitl.plain_file import check_plain
 
 Array = npt.NDArray[Any]
 METADATA_KEY = b"froude"
+MOST_ROWS = 4_000_000
+"""Of a file that is read: more than four hours at 250 rows a second."""
+LARGEST_PARQUET = 2_000_000_000
 NO_SEGMENT = -1
 
 
@@ -207,8 +211,17 @@ class Telemetry:
         import pyarrow.parquet as pq
 
         remedy = "Give a flights/*.parquet of a run"
+        check_plain(Path(path), LARGEST_PARQUET)
         try:
-            table = pq.read_table(path)
+            # a few bytes can stand for any number of rows, and a row of texts for any number of bytes
+            rows, schema = pq.read_metadata(path).num_rows, pq.read_schema(path)
+            if rows > MOST_ROWS:
+                raise FileError(path, f"says that it has {rows} rows; at most {MOST_ROWS} are read", remedy)
+            odd = next((field for field in schema if not pa.types.is_primitive(field.type)), None)
+            if odd is not None and odd.name in COLUMNS:
+                raise FileError(path, f"is damaged: its column {odd.name!r} has the type {odd.type}", remedy)
+            # with columns of others it is refused below, unread
+            table = schema.empty_table() if set(schema.names) - set(COLUMNS) else pq.read_table(path)
         except (OSError, ValueError, MemoryError, pa.ArrowException) as error:
             # Arrow's text may go on for lines, with its own source in it
             problem = str(error).partition("\n")[0]

@@ -8,14 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from sitl.errors import FileError
+from sitl.plain_file import check_plain
 
 
 def read_toml(path: Path) -> dict[str, Any]:
     """The whole file.
 
     Raises:
-        FileError: it cannot be read, is not UTF-8, or is not TOML.
+        FileError: it cannot be read, is no plain file or too large, is not UTF-8, or is not TOML.
     """
+    check_plain(path)
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sitl.errors import FileError
+from sitl.plain_file import check_plain
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
@@ -45,6 +46,7 @@ class KeyedTable:
         Raises:
             FileError: the file cannot be read, or is not TOML.
         """
+        check_plain(path)
         try:
             with path.open("rb") as file:
                 return cls(path, tomllib.load(file))

@@ -19,6 +19,7 @@ from scenarios.flight_import.recorded import Change, Recorded, Signals, Value, r
 from scenarios.flight_import.series import FloatArray, Series, euler
 from sitl.airframe import Rotor
 from sitl.errors import FileError
+from sitl.plain_file import check_plain
 
 _NO_AUTOPILOT, _PX4 = 8, 12
 _NAMES: Final = {_PX4: "PX4", 3: "ArduPilot"}
@@ -30,6 +31,8 @@ _INTEGERS: Final = {1: "<B", 2: "<b", 3: "<H", 4: "<h", 5: "<I", 6: "<i"}
 _NAV_STATES: Final = {mode.custom_mode: state for state, mode in reversed(PX4_MODES.items())}
 _RESTART_S = 1.0
 """Vehicle time that goes back by more than this is another boot."""
+LARGEST = 4_000_000_000
+"""Bytes of a log that is read: some days of telemetry."""
 _CHUNK = 1 << 16
 _STAMP = 8
 _REMEDY = "Record a flight with ATTITUDE and ATTITUDE_TARGET at 20 Hz or more"
@@ -250,6 +253,7 @@ def _read(path: Path) -> tuple[dict[int, _System], Counter[tuple[int, str]], lis
             if components.get(m.sysid) == m.compid:
                 systems[m.sysid].take(m)
 
+    check_plain(path, LARGEST)
     try:
         with path.open("rb") as file:
             while data := file.read(_CHUNK):

@@ -17,6 +17,7 @@ from scenarios.flight_import.recorded import Change, Recorded, Signals, record
 from scenarios.flight_import.series import Series, euler
 from sitl.airframe import Rotor
 from sitl.errors import FileError
+from sitl.plain_file import check_plain
 
 if TYPE_CHECKING:
     from pyulog import ULog
@@ -39,6 +40,10 @@ TOPICS: Final = (
 """The last one, and rates in vehicle_attitude, are those of a PX4 before 1.13 and 1.10."""
 _ARMED_STATE = 2
 _FIXED_WING, _ROVER = 2, 3
+LARGEST = 4_000_000_000
+"""Bytes of a log that is read: some days of flight."""
+MOST_FIELDS: Final = 200_000
+"""Of all topics of a log together; a PX4's has some thousands."""
 _READ_FACTOR = 40
 """Bytes that may be read for each byte of the file: pyulog steps back in damaged ones, now and then for ever."""
 _REMEDY = "Fetch the log from the vehicle again"
@@ -122,9 +127,33 @@ def read_ulog(path: Path, *, rotors: tuple[Rotor, ...] = ()) -> Recorded:
     )
 
 
-def _parse(path: Path) -> ULog:
+def _bounded_reader() -> type[ULog]:
+    """The reader of pyulog, but for topics within topics that a few lines of a file make grow beyond any memory."""
     from pyulog import ULog
 
+    left = MOST_FIELDS
+
+    class Topic(ULog._MessageAddLogged):  # type: ignore[misc]
+        """A topic with its fields, nested ones laid out flat."""
+
+        def _parse_nested_type(self, prefix_str: str, type_name: str, message_formats: Mapping[str, Any]) -> None:
+            nonlocal left
+            # an empty nested topic costs its turn, too
+            left -= 1 + sum(max(1, count) for _, count, _ in message_formats[type_name].fields)
+            if left < 0:
+                raise ValueError(f"its topics have more than {MOST_FIELDS} fields")
+            super()._parse_nested_type(prefix_str, type_name, message_formats)
+
+    class Reader(ULog):  # type: ignore[misc]
+        """pyulog's, with such topics."""
+
+        _MessageAddLogged = Topic
+
+    return Reader
+
+
+def _parse(path: Path) -> ULog:
+    check_plain(path, LARGEST)
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -134,7 +163,7 @@ def _parse(path: Path) -> ULog:
     # pyulog prints what it thinks of a file
     with contextlib.redirect_stdout(io.StringIO()), np.errstate(all="ignore"):
         try:
-            return ULog(_Watched(data), list(TOPICS))
+            return _bounded_reader()(_Watched(data), list(TOPICS))
         except Exception as error:  # pyulog has no list of what damaged files make it raise
             reason = str(error) or "its messages do not fit together"
             raise FileError(path, f"is no ULog that can be read: {reason}", _REMEDY) from error
