@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sitl.airframe import DERIVATIVE_NAMES
-from sitl.crossings import Crossings, IndexArray, Loop, least_of
+from sitl.crossings import CriticalGains, Crossings, IndexArray, Loop, least_of
 from sitl.errors import UsageError
 from sitl.profile import Profile
 from sitl.sampled_loop import ComplexArray, FloatArray, RollGains, SampledLoop
@@ -88,6 +88,58 @@ class Sampled:
         return np.asarray(np.count_nonzero(values >= 1.0 - MARGINAL, axis=-1))
 
 
+class SampledSets(Sampled):
+    """G gain sets on S samples as a `Loop` of G * S rows, sample by sample of the first set, then of the next.
+
+    Args:
+        loop: of the samples. gains: of the sets; all of them integrate, or none does.
+    """
+
+    def __init__(self, loop: SampledLoop, gains: Sequence[RollGains]) -> None:
+        super().__init__(loop.with_gains(gains[0]))
+        self._samples = len(loop.phi)
+        self._gains = {f.name: np.array([getattr(one, f.name) for one in gains]) for f in fields(RollGains)}
+        self._plant: tuple[FloatArray, tuple[ComplexArray, ComplexArray]] | None = None
+
+    def _loop_of(self, sets: IndexArray, samples: IndexArray | None, *, columns: bool = False) -> SampledLoop:
+        """With the gains of some rows as arrays; `columns`: each beside all frequencies."""
+        gains = {name: value[sets][:, None] if columns else value[sets] for name, value in self._gains.items()}
+        loop = self.loop if samples is None else self.loop.sample(samples)
+        return loop.with_gains(RollGains(**gains))  # type: ignore[arg-type]  # floats or arrays of them
+
+    def values(self, omega: FloatArray, rows: IndexArray) -> ComplexArray:
+        """See `Loop`."""
+        sets, samples = np.divmod(rows, self._samples)
+        p, phi = self.loop.plant(omega, samples)
+        on_p, on_phi = self._loop_of(sets, None).controller(omega)
+        return on_p * p + on_phi * phi
+
+    def table(self, omega: FloatArray, rows: slice) -> ComplexArray:
+        """See `Loop`."""
+        sets, samples = np.divmod(np.arange(rows.start, rows.stop), self._samples)
+        if self._samples > _SAMPLES_KEPT:
+            p, phi = self.loop.sample(samples).plant(omega)
+        else:
+            if self._plant is None:
+                self._plant = omega, self.loop.plant(omega)
+            p, phi = (one[samples] for one in self._plant[1])
+        some, place = np.unique(sets, return_inverse=True)
+        on_p, on_phi = self._loop_of(some, None, columns=True).controller(omega)
+        return np.asarray(on_p[place] * p + on_phi[place] * phi)
+
+    def unstable(self, rows: IndexArray, gains: FloatArray) -> IndexArray:
+        """See `Loop`."""
+        sets, samples = np.divmod(rows, self._samples)
+        values = np.abs(self._loop_of(sets, samples).eigenvalues(gains))
+        return np.asarray(np.count_nonzero(values >= 1.0 - MARGINAL, axis=-1))
+
+
+_SAMPLES_KEPT = 512
+"""Samples whose plant is kept at all frequencies for one gain set after the other."""
+_ROWS_AT_ONCE = 2048
+"""Pairs of a gain set and a sample that are worked on together."""
+
+
 def batch_margins(
     derivatives: FloatArray,
     gains: Sequence[RollGains],
@@ -110,7 +162,18 @@ def batch_margins(
     """
     check_models(derivatives, gains)
     loop = SampledLoop(derivatives, gains[0], profile, motor_lag_s, transport_delay_s)
-    return stacked([margins_of_loop(Sampled(loop.with_gains(one)), len(derivatives)) for one in gains])
+    samples, at_once = len(derivatives), max(1, _ROWS_AT_ONCE // len(derivatives))
+    made = {
+        f.name: np.empty((len(gains), samples), bool if "stable" in f.name else float) for f in fields(MarginArrays)
+    }
+    for integrates in (True, False):
+        members = [g for g, one in enumerate(gains) if (one.k * one.ki != 0.0) == integrates]
+        for first in range(0, len(members), at_once):
+            some = members[first : first + at_once]
+            found = margins_of_loop(SampledSets(loop, [gains[g] for g in some]), len(some) * samples)
+            for name, value in made.items():
+                value[some] = getattr(found, name).reshape(len(some), samples)
+    return MarginArrays(**made)
 
 
 def check_models(derivatives: FloatArray, gains: Sequence[RollGains]) -> None:
@@ -193,20 +256,32 @@ def _gain_range(
     # sorted by sample and gain: the first above 1 of each sample
     rows, first = np.unique(critical.row[~below], return_index=True)
     high[rows], at[rows] = critical.gain[~below][first], critical.omega[~below][first]
-    for row in np.flatnonzero(~stable).tolist():
-        mine = critical.row == row
-        low[row], high[row], at[row] = _nearest_range(loop, row, critical.gain[mine], critical.omega[mine])
+    lost = np.flatnonzero(~stable)
+    if len(lost):
+        low[lost], high[lost], at[lost] = np.array(_nearest_ranges(loop, lost, critical)).T
     return low, high, at
 
 
-def _nearest_range(loop: Loop, row: int, gains: FloatArray, omega: FloatArray) -> tuple[float, float, float]:
-    """The same for one unstable loop: its ranges in order of distance, until one is stable."""
-    edges = [0.0, *gains.tolist(), math.inf]
-    ranges = [(a, b, w) for (a, b), w in zip(pairwise(edges), [*omega.tolist(), math.nan], strict=True) if a < b]
-    inside = np.array([_inside(a, b) for a, b, _ in ranges])
-    unstable = loop.unstable(np.full(len(inside), row), inside)
-    held = [one for one, count in zip(ranges, unstable.tolist(), strict=True) if count == 0]
-    return min(held, key=lambda one: _distance(one[0], one[1]), default=(math.nan, math.nan, math.nan))
+def _nearest_ranges(loop: Loop, rows: IndexArray, critical: CriticalGains) -> list[tuple[float, float, float]]:
+    """The same for unstable loops: of all ranges of each, the nearest that is stable."""
+    ranges = []
+    for mine in _parts(critical.row, rows):
+        edges = [0.0, *critical.gain[mine].tolist(), math.inf]
+        omega = [*critical.omega[mine].tolist(), math.nan]
+        ranges.append([(a, b, w) for (a, b), w in zip(pairwise(edges), omega, strict=True) if a < b])
+    inside = np.array([_inside(a, b) for some in ranges for a, b, _ in some])
+    unstable = iter(loop.unstable(np.repeat(rows, [len(some) for some in ranges]), inside).tolist())
+    nearest = []
+    for some in ranges:
+        held = [one for one in some if next(unstable) == 0]
+        nearest.append(min(held, key=lambda one: _distance(one[0], one[1]), default=(math.nan, math.nan, math.nan)))
+    return nearest
+
+
+def _parts(sorted_rows: IndexArray, rows: IndexArray) -> list[slice]:
+    """Where each row's entries are."""
+    first, behind = (np.searchsorted(sorted_rows, rows, side).tolist() for side in ("left", "right"))
+    return [slice(a, b) for a, b in zip(first, behind, strict=True)]
 
 
 def _distance(low: float, high: float) -> float:
@@ -231,8 +306,8 @@ def _phase_and_delay(found: Crossings, unstable: IndexArray, loop_delay_s: float
     unity = found.unity
     np.minimum.at(phase, unity.row, np.minimum(unity.phase_deg, 360.0 - unity.phase_deg))
     np.minimum.at(delay, unity.row, np.radians(unity.phase_deg) / unity.omega)
-    for row in np.flatnonzero(unstable).tolist():
-        mine = unity.row == row
+    lost = np.flatnonzero(unstable)
+    for row, mine in zip(lost.tolist(), _parts(unity.row, lost), strict=True):
         where = list(zip(unity.omega[mine], unity.phase_deg[mine], unity.falling[mine], strict=True))
         count = int(unstable[row])
         leads = [(360.0 - p, bool(inwards)) for _, p, inwards in where]

@@ -72,7 +72,7 @@ class SampledLoop:
     Args:
         derivatives: the lateral model, or an array (S, 6) of samples in the order of DERIVATIVE_NAMES; everything
             that depends on the model then has S as its first dimension.
-        gains: of the roll axis.
+        gains: of the roll axis; fields that are arrays are a set's of each sample (`with_gains`).
         profile: rate, delays and filters; its `motor_lag_s` is not used.
         motor_lag_s: time constant of the motors, 0 for none.
         transport_delay_s: further delay between command and motor, beyond the profile's ticks.
@@ -130,10 +130,15 @@ class SampledLoop:
         return other
 
     @property
+    def integrates(self) -> bool:
+        """Whether there is an integrator; where the gains are arrays, all of them have one or none has."""
+        return bool(np.any(self.gains.k * self.gains.ki))
+
+    @property
     def finite_at_zero(self) -> bool:
         """Whether L has a value at frequency 0: no integrator, no pole of an airframe at rest (Lv = 0)."""
         at_rest = np.abs(np.linalg.eigvals(self.phi) - 1.0).min() < 1e-12
-        return self.gains.k * self.gains.ki == 0.0 and not bool(at_rest)
+        return not self.integrates and not bool(at_rest)
 
     def transfer(self, omega_rad_s: npt.ArrayLike) -> ComplexArray:
         """L(e^(j omega dt)), the loop cut at delta_lat, negative feedback: closed loop where 1 + L = 0.
@@ -182,7 +187,7 @@ class SampledLoop:
         """What multiplies roll rate and roll angle in L: filters and gains.
 
         Args:
-            omega_rad_s: (F,).
+            omega_rad_s: (F,); with gains that are arrays what is returned has the shape that those make with it.
         """
         half = 0.5 * omega_rad_s * self.dt_s
         w = 2j * np.sin(half) * np.exp(1j * half)
@@ -192,7 +197,7 @@ class SampledLoop:
         gyro = (b0 + (b1 + b2 * lag) * lag) / (1.0 + (a1 + a2 * lag) * lag)
         a = self.dgyro_alpha
         slope = w * lag / self.dt_s * a / (1.0 - (1.0 - a) * lag)
-        error = g.k * g.kp + (g.k * g.ki * self.dt_s / w if g.k * g.ki else 0.0)
+        error = g.k * g.kp + (g.k * g.ki * self.dt_s / w if self.integrates else 0.0)
         attitude = g.k_phi * np.polynomial.polynomial.polyval(lag, self.late)
         return (error + g.k * g.kd * slope) * gyro, (error + g.kff) * attitude
 
@@ -221,7 +226,7 @@ class SampledLoop:
         lead = self.phi.shape[:-2]
         commands = self.delay_ticks + (1 if np.any(self.previous) else 0)
         filtered = self.biquad != PASS_THROUGH
-        integrates = g.k * g.ki != 0.0
+        integrates = self.integrates
         angles = len(self.late) - 1
         size = n + commands + 2 * filtered + 2 + integrates + angles
         unit = np.eye(size)
@@ -236,11 +241,11 @@ class SampledLoop:
         y = b0 * p + (unit[filter_at] if filtered else 0.0)
         a = self.dgyro_alpha
         alpha = (1.0 - a) * unit[y_at + 1] + a * (y - unit[y_at]) / self.dt_s
-        rate_sp = -g.k_phi * (
+        rate_sp = -_column(g.k_phi) * (
             self.late[0] * phi + sum(self.late[j] * unit[angle_at + j - 1] for j in range(1, len(self.late)))
         )
         integral = unit[integral_at] if integrates else np.zeros(size)
-        delta = g.k * g.kp * (rate_sp - y) + integral - g.k * g.kd * alpha + g.kff * rate_sp
+        delta = _column(g.k * g.kp) * (rate_sp - y) + integral - _column(g.k * g.kd) * alpha + _column(g.kff) * rate_sp
         direct = (g.k * g.kp + g.kff) * g.k_phi
         now = np.broadcast_to(np.asarray(loop_gain)[..., None] * delta, (*lead, size))
         u = [now, *(unit[command_at + i] for i in range(commands))]
@@ -257,7 +262,7 @@ class SampledLoop:
             rows[..., filter_at + 1, :] = b2 * p - a2 * y
         rows[..., y_at, :], rows[..., y_at + 1, :] = y, alpha
         if integrates:
-            rows[..., integral_at, :] = integral + g.k * g.ki * self.dt_s * (rate_sp - y)
+            rows[..., integral_at, :] = integral + _column(g.k * g.ki * self.dt_s) * (rate_sp - y)
         for i in range(angles):
             rows[..., angle_at + i, :] = phi if i == 0 else unit[angle_at + i - 1]
         setpoint = np.zeros((*lead, size))
@@ -271,8 +276,11 @@ class SampledLoop:
 
     def eigenvalues(self, loop_gain: float | FloatArray = 1.0) -> ComplexArray:
         """Eigenvalues of one tick of the closed loop; stable if all lie inside the unit circle."""
-        values: ComplexArray = np.linalg.eigvals(self.closed_loop_matrix(loop_gain)).astype(complex)
-        return values
+        return np.asarray(np.linalg.eigvals(self.closed_loop_matrix(loop_gain)).astype(complex))
+
+
+def _column(gain: float | FloatArray) -> FloatArray:
+    return np.asarray(gain)[..., None]  # a factor of rows over the state
 
 
 def _horner(coefficients: FloatArray, w: ComplexArray) -> ComplexArray:

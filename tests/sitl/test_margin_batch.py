@@ -239,3 +239,22 @@ class TestBadInput:
         none = batch_margins(d, [RollGains(0.0, 1.0, 0.0, 0.0, 0.0)], PROFILES[2], 0.025)
         assert not none.closed_loop_stable.any()
         assert isinstance(none, MarginArrays)
+
+
+def test_gain_sets_together_are_gain_sets_alone() -> None:
+    """Stable and unstable, with and without integrator, more rows than are worked on at once."""
+    rng = np.random.default_rng(5)
+    model = load_airframe("ant-x").derivatives.as_array()
+    d = model * rng.uniform(0.8, 1.2, (90, 6))
+    gains = [
+        RollGains(k_phi, k, kp, float(rng.choice([0.0, 0.4])), kd, float(rng.choice([0.0, 0.02])))
+        for k_phi, k, kp, kd in rng.uniform([1.0, 0.5, 0.01, 0.0], [14.0, 1.5, 0.5, 0.006], (30, 4)).tolist()
+    ]
+    assert len(d) * len(gains) > 2048
+    together = batch_margins(d, gains, PROFILES[2], 0.02)
+    assert 0.1 < together.closed_loop_stable.mean() < 0.9
+    for g, one in enumerate(gains):
+        alone = batch_margins(d[:7], [one], PROFILES[2], 0.02)
+        for field in fields(MarginArrays):
+            got, wanted = getattr(together, field.name)[g, :7], getattr(alone, field.name)[0]
+            assert got == pytest.approx(wanted, rel=1e-9, abs=1e-12, nan_ok=True), (g, field.name)
