@@ -13,12 +13,13 @@ if TYPE_CHECKING:
     from scenarios.report.drafting import ReportDraft
 
 
-def report_draft(known: RunRecord, jobs: Sequence[FlightJob], candidates: int) -> ReportDraft:
+def report_draft(known: RunRecord, jobs: Sequence[FlightJob], candidates: int, real_time: bool) -> ReportDraft:
     """The report of a run that is about to be flown; a context manager.
 
     Args:
         known: the run without its flights. jobs: what will be flown. candidates: the first so many are; the baseline
             follows.
+        real_time: somebody flies who cannot wait, a real autopilot or a vehicle elsewhere.
     """
     from scenarios.report.drafting import ReportDraft
 
@@ -30,7 +31,7 @@ def report_draft(known: RunRecord, jobs: Sequence[FlightJob], candidates: int) -
         }
         for number, job in enumerate(jobs)
     ]
-    return ReportDraft(run_object(known), sets)
+    return ReportDraft(run_object(known), sets, behind=real_time)
 
 
 def tell_landed(draft: ReportDraft | None, folder: RunFolder | None, number: int, record: FlightRecord) -> None:

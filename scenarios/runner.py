@@ -187,7 +187,8 @@ def _run_scenario(
     draft = None
     if folder is not None and options.report:
         known = RunRecord(scenario, vehicle_description(model), tuple(profile.describe()), ())
-        draft = stack.enter_context(report_draft(known, jobs, len(candidates)))
+        real_time = options.is_hil or not all(job.in_memory for job in jobs)
+        draft = stack.enter_context(report_draft(known, jobs, len(candidates), real_time))
     twins: tuple[Twin, ...] = ()
     if options.is_hil:
         flown, twins = _fly_real(jobs, planned, options, progress)

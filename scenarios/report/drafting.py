@@ -17,6 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
 
+from scenarios.report import helper
 from sitl.errors import FileError
 
 MOST_S = 300.0
@@ -29,9 +30,11 @@ class ReportDraft:
     Args:
         data: what `run.json` will say of scenario, vehicle and profile.
         sets: name, baseline and uploaded of every flight, in the order of the run.
+        behind: what flies has the cores first. On a busy computer the page is late then.
     """
 
-    def __init__(self, data: Mapping[str, Any], sets: Iterable[Mapping[str, Any]]) -> None:
+    def __init__(self, data: Mapping[str, Any], sets: Iterable[Mapping[str, Any]], *, behind: bool = False) -> None:
+        self._words = [helper.BEHIND] if behind else []
         self._known = json.dumps({"data": data, "sets": list(sets)})
         self._process: subprocess.Popen[str] | None = None
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
@@ -39,7 +42,7 @@ class ReportDraft:
         self._folder = Path()
 
     def __enter__(self) -> Self:
-        command = [sys.executable, "-P", "-m", "scenarios.report.helper"]
+        command = [sys.executable, "-P", "-m", "scenarios.report.helper", *self._words]
         with suppress(OSError, ValueError):
             # in a session of its own it does not hear Ctrl-C: the run decides what becomes of it
             process = subprocess.Popen(

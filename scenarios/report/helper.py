@@ -25,14 +25,18 @@ from typing import TYPE_CHECKING, Any
 
 from sitl.errors import FroudeError
 
+BEHIND = "--behind"
+"""Word of the command line: where something flies in real time, the cores are its own first."""
+
 if TYPE_CHECKING:
     from scenarios.report.computed import Computed
     from scenarios.report.windows import TrackTrace
 
 
 def main() -> None:
-    """Serve one run, behind everything that flies: a real autopilot and a board's plant need the cores first."""
-    os.nice(10)
+    """Serve one run; told to, behind everything that flies."""
+    if BEHIND in sys.argv[1:]:
+        os.nice(10)
     told: queue.SimpleQueue[str] = queue.SimpleQueue()
     # read at once, so that who flies never waits for a pipe that is full
     threading.Thread(target=_listen, args=(told,), daemon=True).start()

@@ -385,6 +385,11 @@ class TestDraft:
         assert not [name for name in drawn if re.fullmatch(r"(step|track)\d+-\d+", name)]
         assert "steps0" in drawn  # all gain sets over one another need all flights
 
+    def test_behind_what_flies_in_real_time(self, data):
+        for behind in (False, True):
+            with ReportDraft(data, [], behind=behind) as draft:
+                assert (helper.BEHIND in draft._process.args) == behind
+
     def test_who_flies_never_waits_for_the_helper(self, data, folder):
         with ReportDraft(data, []) as draft:
             draft._process.send_signal(signal.SIGSTOP)

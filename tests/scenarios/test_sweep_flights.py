@@ -67,6 +67,9 @@ class _NoReport:
     def __exit__(self, *_: object) -> None:
         pass
 
+    def landed(self, number: int, flight: object, telemetry: Path) -> None:
+        pass
+
     def begin(self, folder: Path) -> None:
         pass
 
