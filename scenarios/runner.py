@@ -358,7 +358,7 @@ def _fly_side_by_side(
     """In processes of their own; when something stops the run, flights that have begun are flown to their end."""
     flown = Flown()
     # spawn: a forked child of a process that has started Arrow's or Rerun's threads may hang
-    pool = ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn"))
+    pool = ProcessPoolExecutor(min(workers, len(jobs)), get_context("spawn"), interrupts.end_with_parent)
     flights: dict[Future[FlightRecord], int] = {}
     progress(Progress(0, len(jobs), jobs[0].gain_set.name, f"{min(workers, len(jobs))} at a time"))
     try:

@@ -7,7 +7,8 @@ last, if the run comes to an end, where its folder is:
     {"number": 0, "flight": {...}, "telemetry": "logs/.../flights/....parquet"}
     {"write": "logs/..."}
 
-and answers with one line: `{"wrote": "..."}` or `{"failed": "..."}`. At the end of its input it ends.
+and answers with one line: `{"wrote": "..."}` or `{"failed": "..."}`. At the end of its input it ends, at once if it
+was not asked to write.
 """
 
 from __future__ import annotations
@@ -56,8 +57,13 @@ def main() -> None:
 
 
 def _listen(told: queue.SimpleQueue[str]) -> None:
+    asked = False
     for line in sys.stdin:
+        asked = asked or '"write"' in line[:10]
         told.put(line)
+    if not asked:
+        # the run was killed, or has nothing to show: what is being worked out, for many seconds yet, is for nobody
+        os._exit(1)
     told.put("")
 
 

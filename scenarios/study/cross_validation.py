@@ -11,6 +11,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
 
+from scenarios import interrupts
 from scenarios.gain_set import GainSet
 from scenarios.study.printed import AIRFRAMES
 from scenarios.study.result import Row, Table
@@ -41,7 +42,7 @@ def tune_pairs(
     pairs = [(target, reference) for target in AIRFRAMES for reference in AIRFRAMES]
     made = {}
     # two processes: one search is one thread most of the time
-    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+    with ProcessPoolExecutor(2, get_context("spawn"), interrupts.end_with_parent) as pool:
         jobs = [pool.submit(tune_pair, target, reference, profile, samples, seed) for target, reference in pairs]
         for pair, job in zip(pairs, jobs, strict=True):
             made[pair] = job.result()
@@ -75,7 +76,7 @@ def fly_pairs_live(
         a table of ours: one item per pair, gains and what the flight measured.
     """
     rows: list[Row] = []
-    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+    with ProcessPoolExecutor(2, get_context("spawn"), interrupts.end_with_parent) as pool:
         jobs = {pair: pool.submit(fly_live, *pair, one, profile, seed) for pair, one in gains.items()}
         for (target, reference), job in jobs.items():
             item = f"{target} < {reference}"

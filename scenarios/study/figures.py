@@ -7,6 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
+from scenarios import interrupts
 from scenarios.run_folder import write_atomically
 from scenarios.study import cloud_figures, model_figures, pair_figures
 from scenarios.study.result import Figure, Pair
@@ -26,7 +27,7 @@ def draw_all(
         kinds.setdefault((pair.source.partition(" ")[0], pair.profile), []).append(pair)
     drawn: list[Figure] = []
     # two processes: drawing is one thread, and most of what a study takes
-    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+    with ProcessPoolExecutor(2, get_context("spawn"), interrupts.end_with_parent) as pool:
         jobs = [pool.submit(_models), pool.submit(_clouds, samples, seed)]
         jobs += [pool.submit(_pairs, some) for some in kinds.values()]
         for job in jobs:

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import count
-from multiprocessing import get_context, parent_process, resource_tracker
+from multiprocessing import get_context, resource_tracker
 from typing import Any, Protocol
 
 from scenarios import interrupts
@@ -114,16 +113,8 @@ _begun: Any = None
 def _begin(plan: Plan, make: Callable[[Plan], Rows], begun: Any) -> None:
     """A worker keeps its evaluator: samples and matrices of a case are made once."""
     global _evaluator, _begun
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    interrupts.end_with_parent()
     _evaluator, _begun = make(plan), begun
-
-
-def _end_with_parent() -> None:
-    """A killed parent tells nobody; a worker would wait for its next chunk for ever."""
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 def _work(task: Task) -> Columns:
