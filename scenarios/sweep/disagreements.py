@@ -1,4 +1,17 @@
-"""Where the batch and flights of the same candidates differ: a file for machines, a table for people."""
+"""Where the batch and flights of the same candidates differ: a file for machines, a table for people.
+
+`disagreements.json` holds, beside `schema_version`, `fingerprint` of the plan and `complete` (nothing was broken off):
+
+    tolerances      metric -> unit, absolute (in it), share (of the larger value), judged
+    agreeing        how many of the flights do
+    flights         one each: candidate, case, case_name, autopilot (own, px4), run (folder beside this file), gain_set;
+                    batch_passes (its nominal model), outcome, reason (of the flight), verdicts_agree, agrees,
+                    roll_rms_deg (of the difference of the roll angles), reasons (why they differ, as far as known);
+                    metrics: metric, unit, batch, flight, difference (flight minus batch), expected (what telemetry
+                    alone makes of it), tolerance (of the rest), within (null: not judged), reason; in the unit
+    disagreements   those that do not agree: candidate, case, autopilot, run, and all of it in one line, text
+    left_out        what was not flown: case, case_name, candidate (null: all), autopilot, reason
+"""
 
 from __future__ import annotations
 
@@ -76,9 +89,7 @@ def write_disagreements(path: Path, plan: Plan, found: Sequence[Comparison], fli
             if not one.agrees
         ],
         "flights": [_object(one) for one in found],
-        "left_out": [
-            {**asdict(one), "case_name": plan.cases[one.case].name, "case": one.case} for one in flights.left_out
-        ],
+        "left_out": [{**asdict(one), "case_name": plan.cases[one.case].name} for one in flights.left_out],
         "complete": flights.stopped is None,
     }
     file = path / DISAGREEMENTS_JSON
