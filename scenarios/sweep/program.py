@@ -13,7 +13,16 @@ _PARTS = (
     ("sitl", ("*.py", "*.toml")),
     (
         "scenarios",
-        ("batch_*.py", "metrics.py", "monte_carlo.py", "roll_set.py", "limits.py", "manoeuvres.py", "analysis.py"),
+        (
+            "batch_*.py",
+            "metrics.py",
+            "monte_carlo.py",
+            "roll_set.py",
+            "limits.py",
+            "manoeuvres.py",
+            "signals.py",
+            "analysis.py",
+        ),
     ),
     (
         "scenarios/sweep",
