@@ -4,8 +4,8 @@ By default a file lasts from arming to a second after disarming; SDLOG_MODE says
 
     -1 never   0 armed   1 from boot to disarming, then armed   2 from boot to shutdown   4 from arming to shutdown
 
-The file is valid at any moment: what is in it stands in whole messages, and about a second of flight is written at
-once, so a process that is killed loses at most that. A disk that is full ends the log and not the flight.
+The file is valid at any moment: what is in it stands in whole messages, and about a twelfth of a second of flight is
+written at once, so a process that is killed loses at most that. A disk that is full ends the log and not the flight.
 
 Source: PX4 src/modules/logger.
 """
@@ -28,14 +28,15 @@ from sitl.parameters import ParameterTable
 from sitl.setpoints import Sticks
 from sitl.vehicle import Vehicle
 
-FLUSH_US: Final = 1_000_000
-"""Flight that one write carries, us."""
+FLUSH_US: Final = 80_000
+"""Flight that one write carries, us: what a killed program has not written yet is less than a tenth of a second."""
 LINGER_US: Final = 1_000_000
 """Time a log goes on after it is not wanted any more, us."""
 CHECK_US: Final = 10_000
 """Time between two looks at the slow topics, us."""
 MAX_TEXTS: Final = 64
-"""Texts kept per FLUSH_US; further ones are dropped."""
+"""Texts kept per second; further ones are dropped."""
+TEXTS_US: Final = 1_000_000
 MAX_TOTAL_BYTES: Final = 2**30
 MIN_FILE_BYTES: Final = 2**20
 
@@ -109,7 +110,7 @@ class FlightLog:
         self._slow: list[_Due] = []
         self._waiting: list[bytes] = []
         self._texts = 0
-        self._check_us = self._flush_us = 0
+        self._check_us = self._flush_us = self._texts_us = 0
         self._check_period_us = CHECK_US
         self._unwanted_us: int | None = None
         self._revision = -1
@@ -202,6 +203,8 @@ class FlightLog:
         if ended or now_us >= self._flush_us or ring.full:
             self._flush_us = now_us + FLUSH_US
             self._flush(ring)
+            if now_us >= self._texts_us:
+                self._texts, self._texts_us = 0, now_us + TEXTS_US
         if ended:
             self._end()
         elif self._size >= self._file_bytes and self._ring is not None:
@@ -240,7 +243,7 @@ class FlightLog:
         self._revision = self._parameters.revision
         self._slow = [_Due(topic, number) for number, topic in enumerate(topics, start=first_slow)]
         self._size = self._texts = 0
-        self._check_us, self._flush_us = 0, now_us + FLUSH_US
+        self._check_us, self._flush_us, self._texts_us = 0, now_us + FLUSH_US, now_us + TEXTS_US
         self._check_period_us = 0 if profile & Profile.HIGH_RATE else CHECK_US
         self._unwanted_us = None
         self._waiting = [
@@ -265,7 +268,6 @@ class FlightLog:
     def _flush(self, ring: Ring) -> None:
         self._waiting.append(ring.drain(0))
         self._waiting.append(ulog.sync())
-        self._texts = 0
         self._write()
 
     def _write(self) -> None:

@@ -6,6 +6,7 @@ wire. No header. MAVProxy, QGroundControl and pymavlink write and read the same.
 
 from __future__ import annotations
 
+import math
 import struct
 from pathlib import Path
 from types import TracebackType
@@ -26,14 +27,16 @@ class TlogWriter:
     Args:
         path: the file, overwritten if it exists.
         epoch_us: added to every time: SIMULATED_EPOCH_US where times are vehicle time, 0 where they are UTC.
+        waits_s: how long a frame may wait for others, s: with the next one after that, all are written.
 
     Raises:
         FileError: the file cannot be written (from `write` and `close` too, on a full disk).
     """
 
-    def __init__(self, path: str | Path, *, epoch_us: int = SIMULATED_EPOCH_US) -> None:
+    def __init__(self, path: str | Path, *, epoch_us: int = SIMULATED_EPOCH_US, waits_s: float = math.inf) -> None:
         self.path = Path(path)
         self.epoch_us = epoch_us
+        self._waits_us = waits_s * 1e6
         self._written = 0
         self._times_us: list[int] = []
         self._frames: list[bytes] = []
@@ -50,10 +53,11 @@ class TlogWriter:
             frame: the whole frame.
         """
         # stamped when it is written: this runs at every frame of a flight
-        self._times_us.append(time_us)
+        times_us = self._times_us
+        times_us.append(time_us)
         frames = self._frames
         frames.append(frame)
-        if len(frames) >= _MOST_WAITING:
+        if len(frames) >= _MOST_WAITING or time_us - times_us[0] >= self._waits_us:
             self.flush()
 
     @property

@@ -1,7 +1,7 @@
-"""The topics of every control tick: what the loops saw and did, kept for a second and written at once.
+"""The topics of every control tick: what the loops saw and did, kept for a moment and written at once.
 
-A tick costs a few copies of arrays; the samples are made from a whole second of ticks together, topic by topic. A log
-is therefore ordered in time within each topic, and within a second not between topics, which readers do not mind.
+A tick costs a few copies of arrays; the samples are made from many ticks together, topic by topic. A log is therefore
+ordered in time within each topic, and within that moment not between topics, which readers do not mind.
 
 PX4's simulator logs the truth as well, as the `_groundtruth` topics: so does this.
 """

@@ -7,6 +7,7 @@ failure on nothing more is streamed, the flight goes on, and `problem` says what
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -36,6 +37,7 @@ class FlightFiles:
         live_port: port that serves viewers while flying; None for none.
         live_window: open a viewer's window on it.
         rows_per_chunk: telemetry rows that are written together; None for the recorder's own choice.
+        log_s: vehicle time of frames that the log may hold back.
 
     Attributes:
         problem: the first file that could not be written; None while all is well.
@@ -54,6 +56,7 @@ class FlightFiles:
         live_port: int | None = None,
         live_window: bool = False,
         rows_per_chunk: int | None = None,
+        log_s: float = math.inf,
     ) -> None:
         from scenarios.recorder import FlightRecorder, live
         from scenarios.recorder.flight_recorder import ROWS_PER_CHUNK
@@ -76,7 +79,7 @@ class FlightFiles:
             rows_per_chunk=rows_per_chunk or ROWS_PER_CHUNK,
         )
         try:
-            self._tlog = TlogWriter(self.path(".partial.tlog"))
+            self._tlog = TlogWriter(self.path(".partial.tlog"), waits_s=log_s)
         except FileError:
             self._recorder.abandon()
             raise

@@ -156,6 +156,7 @@ class _Flight:
                     live_port=job.live_port,
                     live_window=job.live_window,
                     rows_per_chunk=job.rows_per_chunk,
+                    log_s=job.batch_s,
                 )
             )
             self._files.about = job.about()
@@ -243,7 +244,7 @@ class _Flight:
 
             files.counts = lambda: LinkCounts.of(client.connection.counters)
         inverse = mix_of(job.flown_table()).inverse[:2]
-        self._sampler = Sampler(client, inverse, files.rows if files else None, rows_per_batch=job.rows_per_batch)
+        self._sampler = Sampler(client, inverse, files.rows if files else None, batch_s=job.batch_s)
         if session is not None:
             self._sampler.truth_at = session.truth_at
         return client

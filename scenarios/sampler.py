@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -62,7 +63,8 @@ class Sampler:
         client: whose messages.
         inverse: (2, n) delta_lat and delta_lon per unit of motor command: the pseudo-inverse of the airframe's
             normalised mix.
-        on_batch: called with every `rows_per_batch` finished rows, in order.
+        on_batch: called with every `rows_per_batch` finished rows, in order; with fewer after `batch_s` of vehicle
+            time.
     """
 
     def __init__(
@@ -72,8 +74,11 @@ class Sampler:
         on_batch: Callable[[Columns], object] | None = None,
         *,
         rows_per_batch: int = ROWS_PER_BATCH,
+        batch_s: float = math.inf,
     ) -> None:
         self._rows_per_batch = rows_per_batch
+        self._batch_s = batch_s
+        self._due_s = batch_s
         self._state = client.state
         self._inverse = inverse
         self._motor_count = inverse.shape[1]
@@ -123,9 +128,9 @@ class Sampler:
     def _finish_row(self) -> None:
         if self._attitude is None:
             return
-        state = self._state
+        state, t_s = self._state, self._attitude[0]
         if self.truth_at is not None:
-            self._look_up(self.truth_at(round(self._attitude[0] * 1e3)))
+            self._look_up(self.truth_at(round(t_s * 1e3)))
         rates = self._true_rates or self._rates
         self._true_rates = None
         self._rows.extend(
@@ -136,7 +141,8 @@ class Sampler:
         )
         self._true_quat = _NAN4
         self._attitude = None
-        if len(self._rows) >= self._rows_per_batch * self._values:
+        if len(self._rows) >= self._rows_per_batch * self._values or t_s >= self._due_s:
+            self._due_s = t_s + self._batch_s
             self.flush()
 
     def _look_up(self, truth: Truth | None) -> None:

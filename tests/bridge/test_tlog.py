@@ -44,6 +44,15 @@ def test_the_bytes_are_the_stamp_and_the_frame(tmp_path: Path) -> None:
     assert path.read_bytes() == bytes(range(1, 9)) + b"\xfdframe"
 
 
+def test_frames_wait_no_longer_than_they_may(tmp_path: Path) -> None:
+    path = tmp_path / "a.tlog"
+    with TlogWriter(path, waits_s=0.06) as log:
+        for time_us in range(0, 1_000_000, 4000):
+            log.write(time_us, b"\xfdframe")
+            assert time_us / 4000 + 1 - path.stat().st_size / 14 <= 15
+    assert path.stat().st_size == 250 * 14
+
+
 def test_simulated_flights_make_the_same_file_on_any_day(tmp_path: Path) -> None:
     for name in ("monday", "tuesday"):
         with TlogWriter(tmp_path / name) as log:

@@ -9,11 +9,13 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -27,8 +29,14 @@ from bridge.link import open_link
 from scenarios import interrupts
 from scenarios.flight_files import FlightFiles
 from scenarios.one_flight import FlightJob, FlightStoppedError, fly
+from scenarios.recorder.recording_end import whole_recording
 from scenarios.runner import RunOptions, run_scenario
+from scenarios.stored_flight import log_span_s
 from scenarios.telemetry import Telemetry
+from tests.scenarios.elsewhere import URL, Elsewhere, elsewhere, vehicles
+from tests.sockets import family
+
+__all__ = ["elsewhere", "vehicles"]
 
 ROOT = Path(__file__).parents[2]
 SPEED = 8
@@ -316,6 +324,23 @@ class TestInMemory:
         assert done.returncode == 0, done.stderr
         assert "/roll" in done.stdout
 
+    def test_killed_outright_with_flights_side_by_side(self, tmp_path: Path) -> None:
+        """Those who fly, and who prepares the report, have nobody to work for any more."""
+        process = froude("fly", "demo", "--jobs", "2", "--out", tmp_path)
+        in_flight(tmp_path)
+        started = [pid for pid in family(process.pid) if pid != process.pid]
+        assert len(started) >= 4  # those two, the report's helper, and Python's own
+        process.kill()
+        process.communicate()
+        wait_for(lambda: not [pid for pid in started if running(pid)], "their end")
+
+
+def running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
 
 def frames(log: Path) -> int:
     from pymavlink import mavutil
@@ -440,6 +465,40 @@ class TestInterrupts:
         with interrupts.caught(), pytest.raises(KeyboardInterrupt):
             land(1)
         assert done == ["journal deleted", "landed", "written", "journal deleted"]
+
+
+def test_what_a_flight_over_a_link_leaves_lacks_less_than_a_tenth_of_a_second(
+    tmp_path: Path, quick_job: Any, elsewhere: Elsewhere
+) -> None:
+    """Looked at in the middle of it, as if it had been killed there."""
+    lost: list[tuple[str, float, float]] = []
+
+    def look(phase: str) -> None:
+        if phase in ("step", "land"):
+            # who writes the recording does so in a thread of its own
+            time.sleep(0.5)
+            now_s = elsewhere.vehicle.time_us * 1e-6
+            span = log_span_s(tmp_path / "set.partial.tlog")
+            assert span is not None
+            lost.append(
+                (phase, now_s - span[1], now_s - last_row_s(tmp_path / "set.partial.rrd", tmp_path / "copy.rrd"))
+            )
+
+    fly(quick_job(job={"connect": URL, "folder": tmp_path}), look)
+    assert [phase for phase, *_ in lost] == ["step", "land"]
+    assert max(max(seconds) for _, *seconds in lost) < 0.1, lost
+
+
+def last_row_s(rrd: Path, copy: Path) -> float:
+    """Flight time of the last row of roll, s, in what a recording holds by now."""
+    import rerun as rr
+
+    shutil.copyfile(rrd, copy)
+    with whole_recording(copy) as whole, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a file without an end
+        chunks = [chunk for chunk in rr.chunk.RrdReader(whole).stream() if chunk.entity_path == "/roll"]
+    batches = [chunk.to_record_batch() for chunk in chunks if not chunk.is_static]
+    return max(max(batch.column("flight_time").cast("int64").to_pylist()) for batch in batches) * 1e-9
 
 
 def test_the_files_of_a_flight_are_there_whole_or_called_partial(tmp_path: Path, quick_job: Any) -> None:

@@ -23,10 +23,12 @@ INVERSE = np.array([[-0.5, 0.5, 0.5, -0.5], [0.5, -0.5, 0.5, -0.5]])
 class Wire:
     """Stands in for a client: hands messages to whoever subscribed, in the order that PX4 sends them."""
 
-    def __init__(self, inverse: Any = INVERSE, on_batch: Callable[[Columns], object] | None = None) -> None:
+    def __init__(
+        self, inverse: Any = INVERSE, on_batch: Callable[[Columns], object] | None = None, **options: Any
+    ) -> None:
         self.state = SimpleNamespace(nav_state=14, armed=True)
         self._handlers: dict[str, Callable[[Any], None]] = {}
-        self.sampler = Sampler(self, inverse, on_batch)  # type: ignore[arg-type]
+        self.sampler = Sampler(self, inverse, on_batch, **options)  # type: ignore[arg-type]
 
     def subscribe(self, name: str, handler: Callable[[Any], None]) -> None:
         self._handlers[name] = handler
@@ -135,6 +137,21 @@ def test_every_row_goes_out_once_in_batches_and_comes_back_in_the_telemetry() ->
     assert len(rows) == count
     again = wire.telemetry()  # asking twice changes nothing
     assert again.sha256() == rows.sha256()
+
+
+def test_rows_of_a_vehicle_elsewhere_wait_for_a_moment_only_however_few_they_are() -> None:
+    batches: list[Columns] = []
+    wire = Wire(on_batch=batches.append, batch_s=0.06)
+    times_ms = [*range(4, 1000, 4), *range(1000, 3000, 20), 5000, 5004]
+    for t_ms in times_ms:
+        wire.attitude(t_ms)
+        handed_over = batches[-1]["t_s"][-1] if batches else 0.0
+        finished = [one for one in times_ms if one < t_ms]
+        assert (finished[-1] if finished else 0) * 1e-3 - handed_over < 0.0601
+    assert max(len(batch["t_s"]) for batch in batches) == 16
+    rows = wire.telemetry()["t_s"]
+    assert np.array_equal(np.concatenate([batch["t_s"] for batch in batches]), rows)
+    assert rows.tolist() == pytest.approx([one / 1000 for one in times_ms])
 
 
 def test_rows_belong_to_the_segment_they_are_in() -> None:
