@@ -61,9 +61,7 @@ class FlightStoppedError(Exception):
 
     def __init__(self, record: FlightRecord, cause: BaseException, owed: str = "") -> None:
         super().__init__(str(cause))
-        self.record = record
-        self.cause = cause
-        self.owed = owed
+        self.record, self.cause, self.owed = record, cause, owed
 
     def __reduce__(self) -> tuple[Any, ...]:
         return FlightStoppedError, (self.record, self.cause, self.owed)
