@@ -28,6 +28,7 @@ from scenarios.sweep.plan import Case, Plan
 from sitl.body import RATE_HZ
 from sitl.errors import FileError, FroudeError
 from sitl.parameters import parameter_specs
+from sitl.plain_file import check_plain
 from sitl.profile import get_profile
 
 if TYPE_CHECKING:
@@ -199,12 +200,13 @@ class BestFlights:
             FileError: the index cannot be read.
         """
         path = self.folder / FLOWN_JSON
+        check_plain(path)
         try:
             known = json.loads(path.read_text(encoding="utf-8"))
             points = [FlownPoint(**one) for one in known["flights"]]
         except FileNotFoundError:
             return []
-        except (OSError, ValueError, TypeError, KeyError) as error:
+        except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
             raise FileError(path, f"cannot be read: {error}", "Remove it: everything is then flown again") from error
         there = [one for one in points if one.fingerprint == self.plan.fingerprint]
         return [one for one in there if (self.folder / one.run / RUN_JSON).is_file()]

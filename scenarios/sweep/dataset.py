@@ -25,11 +25,15 @@ from scenarios.sweep.axes import VEHICLE
 from scenarios.sweep.evaluation import STATISTICS, Columns, Task, limits_of, measured_names
 from scenarios.sweep.plan import SCHEMA_VERSION, Plan
 from sitl.errors import FileError, UsageError
+from sitl.plain_file import check_plain
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 SWEEP_JSON = "sweep.json"
+LARGEST_JSON = 256_000_000
+LARGEST_CHUNK = 64_000_000
+"""Bytes of a file of the dataset; one that is larger is none of ours."""
 POINTS = "points"
 
 
@@ -167,13 +171,14 @@ class Dataset:
             FileError: there is none, it is damaged, or of another schema.
         """
         path = self.path / SWEEP_JSON
+        check_plain(path, LARGEST_JSON)
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             raise FileError(self.path, f"is no sweep: it has no {SWEEP_JSON}", "Name the folder of a sweep") from None
         except OSError as error:
             raise FileError(path, f"cannot be read: {error.strerror}") from error
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise FileError(path, f"is damaged: {error}", "Start the sweep anew") from error
         version = found.get("schema_version") if isinstance(found, dict) else None
         if version != SCHEMA_VERSION:
@@ -258,8 +263,9 @@ class Dataset:
             if not number.isdigit() or int(number) >= plan.chunks:
                 continue
             try:
+                check_plain(path, LARGEST_CHUNK)
                 meta = pq.read_metadata(path)
-            except (OSError, ValueError):
+            except (OSError, ValueError, FileError):
                 continue
             chunk = plan.chunk(int(number))
             named = (meta.metadata or {}).get(b"froude_plan", b"").decode()
@@ -282,6 +288,7 @@ class Dataset:
         paths = sorted(self.points.glob("chunk-*.parquet")) if chunks is None else [self.file(n) for n in chunks]
         tables = []
         for path in paths:
+            check_plain(path, LARGEST_CHUNK)
             try:
                 tables.append(pq.read_table(path, columns=None if columns is None else list(columns)))
             except (OSError, ValueError) as error:

@@ -11,6 +11,7 @@ from typing import Any
 from scenarios.limits import METRICS, TITLES
 from scenarios.sweep.sweep_words import many, shown, unit_of
 from sitl.errors import FileError
+from sitl.plain_file import check_plain
 
 DISAGREEMENTS = Path("flights") / "disagreements.json"
 
@@ -101,12 +102,13 @@ def flown_beside(folder: Path) -> FlownBeside | None:
         FileError: the file is damaged.
     """
     path = folder / DISAGREEMENTS
+    check_plain(path)
     try:
         flown = FlownBeside(json.loads(path.read_text(encoding="utf-8")))
         flown.lines()
         assert all(metric["metric"] in METRICS for one in flown.flights for metric in one["metrics"])
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError, AssertionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AssertionError, RecursionError) as error:
         raise FileError(path, f"cannot be read: {error!r}", "Remove it, and fly the best again with --fly") from error
     return flown

@@ -17,11 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from scenarios.analysis import wilson
-from scenarios.sweep.dataset import Dataset
+from scenarios.sweep.dataset import LARGEST_CHUNK, Dataset
 from scenarios.sweep.evaluation import ERROR, PASS
 from scenarios.sweep.objectives import Objective
+from scenarios.sweep.plan import MOST_CHUNK
 from scenarios.sweep.stored_sweep import StoredSweep
 from scenarios.sweep.sweep_words import DIVERGED
+from sitl.errors import FileError
+from sitl.plain_file import check_plain
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -237,13 +240,17 @@ def _tables(sweep: StoredSweep, problems: list[str]) -> Iterator[pa.Table]:
     columns += [one.column for one in sweep.objectives if one.column not in columns]
     for path in sorted(Dataset(sweep.path).points.glob("chunk-*.parquet")):
         try:
+            check_plain(path, LARGEST_CHUNK)
             with pq.ParquetFile(path) as file:
+                if file.metadata.num_rows > MOST_CHUNK:
+                    problems.append(f"{path.name} says that it has {file.metadata.num_rows} rows: not counted")
+                    continue
                 named = (file.metadata.metadata or {}).get(b"froude_plan", b"").decode()
                 if named != sweep.facts["fingerprint"]:
                     problems.append(f"{path.name} is of another sweep: not counted")
                     continue
                 table = file.read(columns=columns)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, FileError) as error:
             problems.append(f"{path.name} cannot be read ({error}): not counted; --resume works it out again")
             continue
         if table.num_rows:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -178,6 +179,22 @@ def test_a_chunk_of_another_sweep_is_not_counted(tmp_path: Path) -> None:
     ranking = rank(stored_sweep(folder))
     assert ranking.points_done == plan.points - 16
     assert ranking.problems == ("chunk-00000000.parquet is of another sweep: not counted",)
+
+
+def test_files_made_to_do_harm_are_not_read(tmp_path: Path) -> None:
+    """A pipe where a chunk or a description should be would be waited for; a hole of a terabyte would be read."""
+    _, folder = made(tmp_path)
+    dataset = Dataset(folder)
+    dataset.file(0).unlink()
+    os.mkfifo(dataset.file(0))
+    with dataset.file(1).open("ab") as file:
+        file.truncate(1 << 40)
+    problems = rank(stored_sweep(folder)).problems
+    assert any("is a device, a pipe or a socket" in one for one in problems), problems
+    assert any("bytes, and at most" in one for one in problems), problems
+    (folder / SWEEP_JSON).write_text("[" * 100_000)
+    with pytest.raises(FileError, match="is damaged"):
+        dataset.facts()
 
 
 def test_a_sweep_that_has_just_begun_has_no_best(tmp_path: Path) -> None:
