@@ -63,16 +63,26 @@ def write_run(
     """
     from scenarios.junit import write_junit
     from scenarios.recorder.comparison import record_compare
+    from sitl.batch import fly_lanes
+    from sitl.compiled import is_compiled
 
     folder.write_run_json(run, command)
     if draft is not None:
         draft.begin(folder.path)
     try:
         write_junit(run, folder.path / "junit.xml")
+        if draft is not None and not is_compiled(fly_lanes):
+            # the very first run: what the comparison needs is being compiled by the report's helper
+            _finish(draft, say)
+            draft = None
         record_compare(run, folder.compare)
     finally:
         if draft is not None:
-            try:
-                draft.finish()
-            except Exception as error:  # whatever it is, the flights are worth more than the page
-                say(f"warning: no report: {error}")
+            _finish(draft, say)
+
+
+def _finish(draft: ReportDraft, say: Callable[[str], object]) -> None:
+    try:
+        draft.finish()
+    except Exception as error:  # whatever it is, the flights are worth more than the page
+        say(f"warning: no report: {error}")

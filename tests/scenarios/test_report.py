@@ -10,6 +10,7 @@ import signal
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from scenarios.report.drafting import ReportDraft
 from scenarios.report.flown_model import flown_model
 from scenarios.report.verdict import verdict_of
 from scenarios.report.windows import step_trace
+from scenarios.run_files import write_run
 from scenarios.run_folder import RunFolder
 from scenarios.run_reader import read_run
 from scenarios.run_shape import RUN, nothing
@@ -403,6 +405,15 @@ class TestDraft:
             draft.begin(folder)
             assert draft.finish() == folder / "report.html"
         assert (folder / "report.html").is_file()
+
+    @pytest.mark.parametrize("compiled", [False, True])
+    def test_the_first_run_ever_waits_for_what_the_helper_compiles(self, flown_run, tmp_path, monkeypatch, compiled):
+        order: list[str] = []
+        monkeypatch.setattr("sitl.compiled.is_compiled", lambda law: compiled)
+        monkeypatch.setattr("scenarios.recorder.comparison.record_compare", lambda *_: order.append("comparison"))
+        draft = SimpleNamespace(begin=lambda folder: order.append("begin"), finish=lambda: order.append("report"))
+        write_run(flown_run, RunFolder.create(tmp_path, "20261122T200000Z", "demo", "ANT-X"), [], draft, print)
+        assert order == ["begin", "comparison", "report"] if compiled else ["begin", "report", "comparison"]
 
     def test_a_report_that_fails_does_not_lose_the_run(self, quick_scenario, tmp_path, monkeypatch):
         def broken(self):
