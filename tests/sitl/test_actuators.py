@@ -158,6 +158,30 @@ class TestMix:
         assert mix.columns[:, PITCH].any()
         assert mix.inverse.shape == (4, 4)
 
+    @pytest.mark.parametrize("length", [0.5, 2.0])
+    def test_effectiveness_is_that_of_an_axis_of_length_one(self, length: float) -> None:
+        slanting = effectiveness([RotorEffect((0.1, 0.2, 0.0), (0.6, 0.0, -0.8))])
+        assert effectiveness([RotorEffect((0.1, 0.2, 0.0), (0.6 * length, 0.0, -0.8 * length))]) == pytest.approx(
+            slanting
+        )
+
+    def test_rotor_without_an_axis_does_nothing(self) -> None:
+        assert not effectiveness([RotorEffect((0.1, 0.2, 0.0), (0.0, 0.0, 0.0))]).any()
+
+    def test_rotor_of_which_nothing_else_is_told_has_px4s_coefficients(self) -> None:
+        matrix = effectiveness([RotorEffect((0.1, 0.2, 0.0))])
+        assert matrix[:, 0] == pytest.approx([-1.3, 0.65, 6.5 * 0.05, 0.0, 0.0, -6.5])
+
+    def test_an_axis_exactly_at_the_threshold_is_given_up(self) -> None:
+        weak = effectiveness([RotorEffect((0.1, 0.2, 0.0), ct=1.0, km=0.05)])
+        assert weak[2, 0] == 0.0
+        assert effectiveness([RotorEffect((0.1, 0.2, 0.0), ct=1.0, km=0.051)])[2, 0] == pytest.approx(0.051)
+
+    def test_one_rotor_that_is_no_number_leaves_the_others_theirs(self) -> None:
+        matrix = effectiveness([RotorEffect((math.nan, 0.1, 0.0)), RotorEffect((0.1, 0.2, 0.0))])
+        assert np.isnan(matrix[:, 0]).all()
+        assert matrix[5, 1] == -6.5
+
     def test_no_rotors_no_mix(self) -> None:
         assert normalised_mix([]).columns.shape == (0, 4)
         assert normalised_mix([]).inverse.shape == (4, 0)
@@ -234,6 +258,12 @@ class TestAllocation:
         roll, pitch, *_ = MIXES["square"].inverse @ mixed(MIXES["square"], (0.5, 1.0, 0.0), 0.5)
         assert pitch == pytest.approx(0.5 / A, abs=1e-3)
         assert abs(roll) < 0.01
+
+    def test_a_motor_without_a_part_in_an_axis_does_not_end_its_desaturation(self) -> None:
+        # motors 2 and 5 of a hexa X have none in pitch; those behind them are the ones at the limit
+        roll, pitch, _, thrust = MIXES["hexa X"].inverse @ mixed(MIXES["hexa X"], (0.0, 2.0, 0.0), 0.5)
+        assert pitch == pytest.approx(0.5 / A, abs=1e-4)
+        assert (roll, thrust) == pytest.approx((0.0, 0.5), abs=1e-9)
 
     def test_yaw_comes_last(self) -> None:
         got = MIXES["square"].inverse @ mixed(MIXES["square"], (0.5, 0.0, 1.0), 0.5)

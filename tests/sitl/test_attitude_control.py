@@ -31,6 +31,10 @@ def negated(quat: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(-c for c in quat)
 
 
+def same_attitude(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
+    return abs(float(np.dot(one, other))) > 1.0 - 1e-6
+
+
 class TestOneAxis:
     @pytest.mark.parametrize("error_rad", [1e-4, 0.2, -0.7, 1.5, 3.0])
     def test_pure_roll_error_asks_for_p_times_twice_the_sine_of_its_half(self, error_rad: float) -> None:
@@ -60,6 +64,24 @@ class TestOneAxis:
         assert rates[2] == pytest.approx(0.0, abs=0.12)
         assert all(math.isfinite(rate) for rate in rates)
 
+    @pytest.mark.parametrize(("weight", "expected"), [(1e-4, 0.0), (1.5e-4, 2.8 * 0.5)])
+    def test_a_weight_up_to_a_ten_thousandth_counts_as_none(self, weight: float, expected: float) -> None:
+        rates = attitude_control(LEVEL, from_euler(0.0, 0.0, 0.5), GAIN, weight, FREE, NO_YAW_RATE)
+        assert rates[2] == pytest.approx(expected, abs=1e-3)
+
+    def test_a_hairs_breadth_of_tilt_does_not_make_yaw_count_in_full(self) -> None:
+        error = attitude_error(LEVEL, from_euler(1e-6, 0.0, 1.0), 0.4)
+        assert error == pytest.approx((0.0, 0.0, 2.0 * math.sin(0.2)), abs=1e-5)
+
+    @pytest.mark.parametrize("sign", [1.0, -1.0])
+    def test_half_a_turn_of_yaw_survives_rounding(self, sign: float) -> None:
+        # the quaternion between the two is often longer than 1 by a rounding, of which there is no arc sine
+        for heading in np.linspace(-3.0, 3.0, 61):
+            quat = from_euler(0.1, 0.4, float(heading))
+            error = attitude_error(quat, multiply(quat, (0.0, 0.0, 0.0, sign)), 0.4)
+            assert error[:2] == pytest.approx((0.0, 0.0), abs=1e-6)
+            assert abs(error[2]) == pytest.approx(2.0 * math.sin(0.4 * math.pi / 2.0), abs=1e-6)
+
     @pytest.mark.parametrize("quat_sp", [(2.0, 0.0, 0.0, 0.0), (0.5, 0.1, 0.0, 0.0)])
     def test_length_of_the_set_point_does_not_matter(self, quat_sp: tuple[float, ...]) -> None:
         length = math.hypot(*quat_sp)
@@ -78,6 +100,26 @@ class TestUpsideDown:
         rates = attitude_control(from_euler(3.1, 0.0, 0.0), LEVEL, GAIN, 0.4, FREE, NO_YAW_RATE)
         assert rates[0] == pytest.approx(-6.5 * 2.0 * math.sin(1.55), rel=1e-9)
 
+    @pytest.mark.parametrize(("gap_rad", "taken_whole"), [(8e-3, True), (10e-3, False)])
+    @pytest.mark.parametrize("axis", [0, 1])
+    def test_near_half_a_turn_of_roll_or_pitch_the_set_point_is_taken_whole(
+        self, axis: int, gap_rad: float, taken_whole: bool
+    ) -> None:
+        # PX4 does so where less than 4.5e-3 is left of the cosine of half the way
+        angles = [0.0, 0.0, 0.0]
+        angles[axis] = math.pi - gap_rad
+        tilt = from_euler(*angles)
+        quat_sp = multiply(tilt, from_euler(0.0, 0.0, 0.5))
+        expected = quat_sp if taken_whole else tilt
+        assert same_attitude(reduced_attitude(LEVEL, quat_sp), expected)
+
+    @pytest.mark.parametrize(("gap_rad", "taken_whole"), [(0.9e-5, True), (1.2e-5, False)])
+    def test_about_a_slanting_axis_only_where_no_way_is_the_shortest(self, gap_rad: float, taken_whole: bool) -> None:
+        half = (math.pi - gap_rad) / 2.0
+        tilt = (math.cos(half), math.sin(half) * math.sqrt(0.5), math.sin(half) * math.sqrt(0.5), 0.0)
+        quat_sp = multiply(tilt, from_euler(0.0, 0.0, 0.5))
+        assert same_attitude(reduced_attitude(LEVEL, quat_sp), quat_sp if taken_whole else tilt)
+
 
 class TestLimitsAndFeedForward:
     def test_each_axis_is_held_to_its_own_limit(self) -> None:
@@ -86,6 +128,14 @@ class TestLimitsAndFeedForward:
         assert rates[0] == 1.0
         assert rates[1] == -0.5
         assert abs(rates[2]) == 0.2
+
+    @pytest.mark.parametrize("axis", [0, 1, 2])
+    @pytest.mark.parametrize("sign", [1.0, -1.0])
+    def test_each_limit_holds_on_both_sides(self, axis: int, sign: float) -> None:
+        limit, angles = (0.3, 0.2, 0.1), [0.0, 0.0, 0.0]
+        angles[axis] = sign * 0.5
+        rates = attitude_control(LEVEL, from_euler(*angles), GAIN, 0.4, limit, NO_YAW_RATE)
+        assert rates[axis] == sign * limit[axis]
 
     def test_px4s_default_limit_is_met_at_57_degrees(self) -> None:
         limit = math.radians(220.0)
