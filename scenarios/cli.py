@@ -10,7 +10,15 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import NoReturn
 
-from scenarios import analyse_command, fly_command, hil_command, restore_command, review_command, sitl_command
+from scenarios import (
+    analyse_command,
+    fly_command,
+    hil_command,
+    restore_command,
+    review_command,
+    sitl_command,
+    standard_streams,
+)
 from scenarios.identification import identify_command
 from scenarios.study import study_command
 from scenarios.sweep import sweep_command
@@ -144,6 +152,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     from sitl.errors import FroudeError
 
+    if argv is None:
+        standard_streams.reopen()
     parser = _parser()
     args = parser.parse_args(argv)
     args.argv = list(sys.argv[1:] if argv is None else argv)
@@ -166,7 +176,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _tell("interrupted", EXIT_INTERRUPTED)
     except BrokenPipeError:
         # the reader of our output went away (froude model ... | head): nothing is wrong, and nothing can be told
-        fly_command.mute_stdout()
+        standard_streams.mute_stdout()
         return EXIT_OK
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""

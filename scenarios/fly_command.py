@@ -144,6 +144,7 @@ def _report(args: argparse.Namespace, result: RunResult, tell: Tell) -> int:
     """Print the result; the exit status that it means."""
     from scenarios.limits import Outcome
     from scenarios.run_folder import RunFolder, run_object
+    from scenarios.standard_streams import show
     from scenarios.table import run_text, terminal_width
     from sitl.errors import FroudeError
 
@@ -154,7 +155,7 @@ def _report(args: argparse.Namespace, result: RunResult, tell: Tell) -> int:
     else:
         width, colour = terminal_width(sys.stdout)
         text = run_text(run, folder, width=width, colour=colour)
-    unread = _show(text)
+    unread = show(text, "The result is in run.json")
     stopped = result.stopped or unread
     for write, path in ((_write_junit, args.junit), (_write_markdown, args.markdown)):
         try:
@@ -183,29 +184,6 @@ def _write_markdown(run: RunRecord, path: Path) -> None:
     from scenarios.job_summary import write_job_summary
 
     write_job_summary(run, path)
-
-
-def _show(text: str) -> Exception | None:
-    """Print a result; what went wrong, but a reader that went away (froude fly | head) is no trouble."""
-    from sitl.errors import FileError
-
-    try:
-        if sys.stdout is not None:
-            sys.stdout.write(text)
-            sys.stdout.flush()
-    except BrokenPipeError:
-        mute_stdout()
-    except OSError as error:
-        mute_stdout()
-        return FileError("standard output", f"cannot be written: {error.strerror}", "The result is in run.json")
-    return None
-
-
-def mute_stdout() -> None:
-    """Let Python's own flush at exit go nowhere instead of failing."""
-    null = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, sys.stdout.fileno())
-    os.close(null)
 
 
 def _live_port() -> int:

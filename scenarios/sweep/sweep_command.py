@@ -205,7 +205,7 @@ def _fly(path: Path, args: argparse.Namespace, tell: Tell) -> None:
             tell=tell,
         )
     if not args.json:
-        sys.stdout.write(text)
+        _print(text, path)
 
 
 def _show(path: Path, args: argparse.Namespace, tell: Tell) -> int:
@@ -215,5 +215,13 @@ def _show(path: Path, args: argparse.Namespace, tell: Tell) -> int:
 
     width, colour = terminal_width(sys.stdout)
     passing, text = show_sweep(path, as_json=args.json, width=width, colour=colour, tell=tell)
-    sys.stdout.write(text)
+    _print(text, path)
     return EXIT_GATE if args.gate and not passing else EXIT_OK
+
+
+def _print(text: str, path: Path) -> None:
+    """Whoever reads it may go away: what there is to do is done all the same, and the exit status says how it went."""
+    from scenarios.standard_streams import show
+
+    if (problem := show(text, f"Look at it again: froude sweep --show {path}")) is not None:
+        raise problem
