@@ -40,7 +40,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "sitl/actuators.py": ("tests/sitl/test_actuators.py",),
     "sitl/froude.py": ("tests/sitl/test_froude.py",),
     "bridge/param_protocol.py": PARAMS,
-    "bridge/param_operation.py": PARAMS,
+    "bridge/param_operation.py": ("tests/bridge/test_param_operation.py", *PARAMS),
     "scenarios/metrics.py": ("tests/scenarios/test_metrics.py",),
     "scenarios/limits.py": ("tests/scenarios/test_limits.py", "tests/scenarios/test_score.py"),
     "scenarios/batch_metrics.py": ("tests/scenarios/test_monte_carlo.py",),

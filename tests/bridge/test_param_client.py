@@ -226,6 +226,7 @@ def test_a_vehicle_that_clamps_is_a_mismatch_with_the_value_it_keeps() -> None:
     assert result.outcome is Outcome.MISMATCH
     assert result.seen == ParamValue("REAL32", struct.pack("<f", 0.5))
     assert "keeps 0.5" in result.reason
+    assert result.tries == 5
 
 
 def test_one_bit_off_is_not_success() -> None:
