@@ -1,9 +1,9 @@
 """A search: candidates asked of an optimiser, generation by generation, towards what passes everywhere and is best.
 
-The optimiser is optuna's: NSGA-II for two objectives or more, TPE for one, its constraint being the samples that fail
-in the worst case. It is asked for a whole generation before it is told anything, in the order of the candidates, so a
-search gives the same candidates whatever the engine; and a search that goes on after a stop asks all of it again and
-takes the answers from the dataset.
+The optimiser is optuna's: NSGA-II for two objectives or more, TPE for one, its constraint being how far the limits are
+missed in the worst case. It is asked for a whole generation before it is told anything, in the order of the candidates,
+so a search gives the same candidates whatever the engine; and a search that goes on after a stop asks all of it again
+and takes the answers from the dataset.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from scenarios.limits import Limit
 from scenarios.sweep.axes import ParameterAxis, as_stored
-from scenarios.sweep.evaluation import PASS
+from scenarios.sweep.evaluation import PASS, limits_of, measured_names
 from scenarios.sweep.plan import Plan
 from scenarios.sweep.ranking import cost
 from sitl.errors import FileError
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 
 _SHORT = "froude:short"
-"""Attribute of a trial: samples, in per cent, that must pass and do not, in the worst case."""
+"""Attribute of a trial: by how much it misses the limits in the worst case, 0 where it passes."""
 
 
 class Search:
@@ -52,7 +53,11 @@ class Search:
             sampler: Any
             if len(objectives) > 1:
                 sampler = optuna.samplers.NSGAIISampler(
-                    population_size=plan.sweep.design.generation, seed=seed, constraints_func=_constraint
+                    population_size=plan.sweep.design.generation,
+                    # children near their parents: the default only swaps values, and comes no nearer to a front
+                    crossover=optuna.samplers.nsgaii.VSBXCrossover(),
+                    seed=seed,
+                    constraints_func=_constraint,
                 )
             else:
                 sampler = optuna.samplers.TPESampler(seed=seed, constraints_func=_constraint, constant_liar=True)
@@ -90,16 +95,20 @@ class Search:
             for case in range(cases)
         ]
         objectives = plan.sweep.objectives
-        names = ["candidate", "outcome", "nominal_passes", "pass_pct", *(axis.name for axis in self._axes)]
-        table = dataset.read([*names, *(one.column for one in objectives)], chunks).to_pydict()
+        limits = limits_of(plan)
+        measured = measured_names(plan)
+        names = ["candidate", "outcome", "samples", *(axis.name for axis in self._axes)]
+        names += [one.column for one in objectives]
+        names += [f"failing_{limit.metric}" for limit in limits]
+        names += [f"{limit.metric}_median" for limit in limits if limit.metric in measured]
+        table = dataset.read(list(dict.fromkeys(names)), chunks).to_pydict()
         at = np.array(table["candidate"]) - start
         held = np.column_stack([np.array(table[axis.name], dtype=np.float64) for axis in self._axes])
         if not np.array_equal(held, values[at]):
             problem = "holds other candidates than this search asks for: another version of optuna made it"
             raise FileError(dataset.path, problem, "Start the sweep anew")
-        share = np.array([-1.0 if one is None else one for one in table["pass_pct"]])
         passed = np.array([one == PASS for one in table["outcome"]])
-        short = np.where(passed, 0.0, np.maximum(plan.sweep.required_pass_pct - share, 1e-3))
+        short = np.where(passed, 0.0, np.maximum(sum(_beyond(limit, table) for limit in limits), 1e-3))
         for k, trial in enumerate(self._asked):
             mine = at == k
             trial.set_user_attr(_SHORT, float(short[mine].max()))
@@ -111,6 +120,24 @@ class Search:
 
 def _constraint(trial: Any) -> tuple[float]:
     return (float(trial.user_attrs.get(_SHORT, 100.0)),)
+
+
+def _beyond(limit: Limit, table: dict[str, list[Any]]) -> FloatArray:
+    """By how much points miss a limit: the share of their samples that do, and how far the median is from it.
+
+    Where no sample passes, the second tells what is nearer to passing.
+    """
+    samples = np.array(table["samples"], dtype=np.float64)
+    share = np.where(samples > 0, np.array(table[f"failing_{limit.metric}"]) / np.maximum(samples, 1.0), 1.0)
+    if f"{limit.metric}_median" not in table:
+        return np.asarray(share + 1.0)
+    median = np.array(table[f"{limit.metric}_median"], dtype=np.float64)
+    over = [
+        sign * (median - bound) / (abs(bound) or 1.0)
+        for sign, bound in ((1.0, limit.maximum), (-1.0, limit.minimum))
+        if bound is not None
+    ]
+    return np.asarray(share + np.clip(np.nan_to_num(np.max(over, axis=0), nan=1.0), 0.0, 1.0))
 
 
 def _worst(costs: FloatArray) -> float:
