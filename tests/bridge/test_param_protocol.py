@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from bridge.connection import Connection, Message
 from bridge.param_protocol import Outgoing, ParamServer, float_in_disguise
-from sitl.parameters import ParameterTable
+from sitl.parameters import ParameterSpec, ParameterTable
 
 GROUND, API = 0, 1
 TICK_US = 4_000
@@ -331,6 +331,97 @@ def test_a_float_sent_as_an_int_is_stored_and_noticed(name: str, raw: bytes, mea
     assert len(notices) == (meant is not None)
     assert all(name in text and f"float {meant:g}" in text for text in notices)
     assert ground.server.take_notices() == []
+
+
+@pytest.mark.parametrize(
+    ("documented", "meant"),
+    [
+        ({}, 5.0),
+        ({"minimum": 0}, None),
+        ({"maximum": 2_000_000_000}, None),
+        ({"values": {1084227584: "5.0 as four bytes"}}, None),
+        ({"maximum": 100}, 5.0),
+        ({"minimum": 2_000_000_000}, 5.0),
+        ({"values": {5: "five"}}, 5.0),
+    ],
+)
+def test_a_number_inside_what_is_documented_was_meant(documented: dict[str, Any], meant: float | None) -> None:
+    assert float_in_disguise(ParameterSpec("X", "INT32", 0, **documented), struct.pack("<f", 5.0)) == meant
+
+
+@pytest.mark.parametrize(
+    ("number", "counts"),
+    [(0.0015, True), (0.0009, False), (-0.0015, True), (1e6, True), (1.5e6, False), (float("inf"), False)],
+)
+def test_only_a_float_of_ordinary_size_was_meant(number: float, counts: bool) -> None:
+    meant = float_in_disguise(ParameterSpec("X", "INT32", 0), struct.pack("<f", number))
+    assert meant == (pytest.approx(number) if counts else None)
+
+
+def test_the_first_and_the_last_index_are_read_and_the_one_behind_is_refused() -> None:
+    ground = Ground()
+    count = len(ground.table)
+    for index in (0, count - 1):
+        (answer,) = ground.ask("PARAM_REQUEST_READ", param_id="", param_index=index)
+        assert (answer.param_id, answer.param_index) == (ground.table.names[index], index)
+    (refusal,) = ground.ask("PARAM_REQUEST_READ", param_id="", param_index=count)
+    assert (refusal.name, refusal.error, refusal.param_index) == ("PARAM_ERROR", 1, count)
+    (refusal,) = ground.ask("PARAM_REQUEST_READ", param_id="NOBODY", param_index=-1)
+    assert (refusal.name, refusal.error, refusal.param_index) == ("PARAM_ERROR", 1, 0)
+    assert ground.server.refused == 2
+
+
+def requested_list() -> Message:
+    (message,) = Connection(1, 1).receive(
+        Connection(255, 190).encode("PARAM_REQUEST_LIST", target_system=1, target_component=1)
+    )
+    return message
+
+
+def test_bursts_keep_their_grid_whatever_the_tick_and_are_never_made_up_for() -> None:
+    server = ParamServer(ParameterTable())
+    server.handle(requested_list(), GROUND, 0)
+    sent = {now_us: len(server.poll(GROUND, now_us)) for now_us in range(0, 25_000, 2_500)}
+    # due at 0, 4, 8, 12, 16, 20 ms: at the first tick after each
+    assert [now_us for now_us, count in sent.items() if count] == [0, 5_000, 10_000, 12_500, 17_500, 20_000]
+    assert set(sent.values()) == {0, 20}
+    assert len(server.poll(GROUND, 1_000_000)) == 20
+    assert server.poll(GROUND, 1_001_999) == []
+    assert len(server.poll(GROUND, 1_002_000)) == 20
+
+
+def test_a_list_does_not_wait_for_an_announcement() -> None:
+    server = ParamServer(ParameterTable())
+    server.poll(GROUND, 0)
+    server.table.set("MC_ROLL_P", 7.0)
+    assert server.poll(GROUND, 1_000) == []
+    server.handle(requested_list(), GROUND, 2_000)
+    assert len(server.poll(GROUND, 2_000)) == 20
+    # nor does it wait for what changes on the way
+    server.table.set("MC_ROLL_P", 7.5)
+    assert len(server.poll(GROUND, 6_000)) == 20
+
+
+def test_a_second_change_does_not_put_off_the_first_ones_announcement() -> None:
+    server = ParamServer(ParameterTable())
+    server.poll(GROUND, 0)
+    server.table.set("MC_ROLL_P", 7.0)
+    assert server.poll(GROUND, 1_000) == []
+    server.table.set("MC_PITCH_P", 7.0)
+    assert server.poll(GROUND, 11_000) == []
+    assert server.poll(GROUND, 20_999) == []
+    assert [fields["param_id"] for _, fields in server.poll(GROUND, 21_000)] == ["MC_ROLL_P", "MC_PITCH_P"]
+
+
+def test_of_many_notices_the_last_64_are_kept() -> None:
+    ground = Ground()
+    for number in range(70):
+        raw = struct.pack("<f", 1000.0 + number)
+        ground.send("PARAM_SET", param_id="MC_AIRMODE", param_value=raw, param_type=INT32)
+    notices = ground.server.take_notices()
+    assert len(notices) == 64
+    assert "float 1006:" in notices[0]
+    assert "float 1069:" in notices[-1]
 
 
 def test_a_closed_link_is_forgotten() -> None:
