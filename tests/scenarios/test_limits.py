@@ -105,9 +105,83 @@ def test_every_limit_set_limits_known_metrics() -> None:
         assert {limit.metric for limit in limits} <= set(METRICS)
 
 
+def test_the_sets_are_those_the_readme_prints() -> None:
+    printed = {name: [(limit.metric, str(limit)) for limit in limits] for name, limits in LIMIT_SETS.items()}
+    assert printed == {
+        "practical": [
+            ("oscillation_rad_s", "<= 0.3 rad/s"),
+            ("overshoot_pct", "<= 10 %"),
+            ("rise_time_s", "<= 0.4 s"),
+            ("delay_margin_s", ">= 0.01 s"),
+        ],
+        "study": [
+            ("oscillation_rad_s", "<= 0.3 rad/s"),
+            ("settling_time_5pct_s", "<= 0.5 s"),
+            ("overshoot_pct", "<= 0.15 %"),
+        ],
+        "none": [],
+    }
+
+
+@pytest.mark.parametrize(
+    ("limit", "inside", "outside"),
+    [
+        (Limit("droop_deg", -3.0, 3.0), (-3.0, 0.0, 3.0), (-3.001, 3.001)),
+        (Limit("droop_deg", minimum=0.0), (0.0, 1e9), (-1e-9,)),
+        (Limit("droop_deg", maximum=0.0), (0.0, -1e9), (1e-9,)),
+    ],
+)
+def test_both_ends_belong_to_a_limit(limit: Limit, inside: tuple[float, ...], outside: tuple[float, ...]) -> None:
+    assert all(limit.holds(value) for value in inside)
+    assert not any(limit.holds(value) for value in outside)
+
+
+def test_a_failure_names_everything_that_failed_and_what_is_known_of_it() -> None:
+    metrics = (
+        measured("oscillation_rad_s", 0.5),
+        measured("overshoot_pct", 40.0, "first step"),
+        measured("peak_delta_lat", 0.7),
+        measured("lag_s", None, "the lag exceeds 1 s"),
+    )
+    limits = (
+        Limit("overshoot_pct", maximum=10.0),
+        Limit("peak_delta_lat", maximum=0.5),
+        Limit("lag_s", maximum=0.2),
+        Limit("vaf_pct", minimum=60.0),
+    )
+    outcome, reason, judged = judge(metrics, limits, failure="timed out")
+    assert outcome is Outcome.FAIL
+    assert reason == (
+        "timed out; oscillation 0.5 rad/s, limit <= 0.3 rad/s; overshoot 40 %, limit <= 10 % (first step); "
+        "peak delta_lat 0.7, limit <= 0.5"
+    )
+    assert [(one.name, one.limit, str(one.outcome)) for one in judged] == [
+        ("oscillation_rad_s", "<= 0.3 rad/s", "FAIL"),
+        ("overshoot_pct", "<= 10 %", "FAIL"),
+        ("peak_delta_lat", "<= 0.5", "FAIL"),
+        ("lag_s", "<= 0.2 s", "UNSET"),
+        ("vaf_pct", ">= 60 %", "UNSET"),
+    ]
+    rest = judge((measured("oscillation_rad_s", 0.1), metrics[3]), limits[2:])
+    assert rest[:2] == (
+        Outcome.UNSET,
+        "lag unset: the lag exceeds 1 s; VAF unset: not measured in this scenario",
+    )
+
+
+def test_what_is_no_number_was_not_measured() -> None:
+    unset = measured("lag_s", float("nan"), "why", "step/1")
+    assert (unset.value, unset.outcome, unset.unit, unset.reason, unset.segment) == (
+        None, Outcome.UNSET, "s", "why", "step/1",
+    )  # fmt: skip
+    assert measured("lag_s", 0.1, "how", "step/1").outcome is Outcome.INFO
+
+
 def test_parse_limits() -> None:
     parsed = parse_limits([{"metric": "vaf_pct", "min": 60}, {"metric": "droop_deg", "min": -3, "max": 3}], "f")
     assert parsed == (Limit("vaf_pct", 60.0), Limit("droop_deg", -3.0, 3.0))
+    assert parse_limits([{"metric": "lag_s", "min": 0, "max": 0}], "f") == (Limit("lag_s", 0.0, 0.0),)
+    assert parse_limits([], "f") == ()
     assert str(parsed[1]) == ">= -3 deg and <= 3 deg"
     assert parse_limits("study", "f") is LIMIT_SETS["study"]
 
@@ -125,6 +199,10 @@ def test_parse_limits() -> None:
         ([{"metric": "vaf_pct", "min": 2, "max": 1}], "exceeds max"),
         ([{"metric": "vaf_pct", "min": 2}, {"metric": "vaf_pct", "max": 1}], "limited twice"),
         ([{"max": 1}], "has no metric"),
+        ([7], "limit 1 has no metric"),
+        ([{"metric": "vaf_pct", "max": 1}, {"max": 1}], "limit 2 has no metric"),
+        ([{"metric": "vaf_pct", "min": "1"}], "min = '1' is not a finite number"),
+        ([{"metric": "vaf_pct", "min": 0, "max": float("inf")}], "max = inf is not a finite number"),
     ],
 )
 def test_bad_limits_name_the_mistake(value: Any, text: str) -> None:

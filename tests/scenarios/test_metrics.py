@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scenarios.limits import Metric, Outcome
+from scenarios.limits import LIMIT_CYCLE_RAD_S, Metric, Outcome
 from scenarios.metrics import (
+    Oscillation,
     divergence,
     dominant_frequency,
     effort_metrics,
@@ -207,6 +208,104 @@ def test_tracking_does_not_depend_on_sign_size_or_epoch(sign: float, size: float
     for name in ("vaf_pct", "vaf_lag_removed_pct", "lag_s"):
         assert moved[name] == pytest.approx(plain[name], abs=1e-4)
     assert moved["rms_error_deg"] == pytest.approx((plain["rms_error_deg"] or 0) * size, rel=1e-6)
+
+
+def test_an_oscillation_that_was_not_measured_says_why_and_is_no_limit_cycle() -> None:
+    unknown = Oscillation((9.0, 9.0, 9.0), "", None, "only 3 samples")
+    assert str(unknown) == "only 3 samples"
+    assert math.isnan(unknown.worst_rad_s)
+    assert not unknown.is_limit_cycle
+    assert not Oscillation((0.1, LIMIT_CYCLE_RAD_S, 0.2), "pitch", None).is_limit_cycle
+    assert str(Oscillation((0.1, 0.31, 0.2), "pitch", None)) == "limit cycle 0.31 rad/s in pitch"
+    assert str(Oscillation((0.1, 0.05, 0.2), "yaw", 4.0)) == "rate 4.0 Hz, 0.2 rad/s in yaw"
+
+
+def test_an_oscillation_needs_two_seconds_and_not_more() -> None:
+    still = np.zeros_like(T)
+    assert not oscillation(T, still, still, still, start_s=1.0, end_s=3.0).reason
+    assert oscillation(T, still, still, still, start_s=1.01, end_s=3.0).reason
+    # only the last second counts
+    early = np.where(T < 1.9, 5.0 * np.sin(40.0 * T), 0.0)
+    assert oscillation(T, early, still, still, start_s=0.0, end_s=3.0).worst_rad_s == 0.0
+    assert oscillation(T, early, still, still, start_s=0.0, end_s=2.0).worst_rad_s > 1.0
+
+
+@pytest.mark.parametrize(("std_rad_s", "known"), [(0.019, False), (0.021, True)])
+def test_a_rate_near_noise_has_no_frequency(std_rad_s: float, known: bool) -> None:
+    shake = oscillation(
+        T, math.sqrt(2.0) * std_rad_s * np.sin(2 * math.pi * 5.0 * T), 0 * T, 0 * T, start_s=0.0, end_s=3.0
+    )
+    assert (shake.frequency_hz is not None) is known
+
+
+def test_a_step_that_jumps_is_there_at_once() -> None:
+    jumped = step(T, np.where(T >= -0.001, A, 0.0))
+    assert values(jumped) == {
+        "overshoot_pct": pytest.approx(0.0, abs=1e-9),
+        "rise_time_s": 0.0,
+        "settling_time_5pct_s": pytest.approx(0.0, abs=1e-9),
+        "settling_time_2pct_s": pytest.approx(0.0, abs=1e-9),
+        "droop_deg": pytest.approx(0.0, abs=1e-9),
+    }
+
+
+def test_a_set_point_that_does_not_step() -> None:
+    metrics = step(T, 0 * T, amplitude=0.0)
+    assert len(metrics) == 5
+    assert {metric.reason for metric in metrics} == {"the set-point does not step"}
+
+
+@pytest.mark.parametrize(("hold", "measured_"), [(1.0, True), (0.99, False)])
+def test_droop_needs_a_second_of_hold(hold: float, measured_: bool) -> None:
+    droop = step(T, np.where(T >= 0, 0.9 * A, 0.0), hold=hold)[-1]
+    assert (droop.value is not None) is measured_
+    assert droop.reason == ("" if measured_ else "held for 0.99 s: droop needs 1 s")
+    if measured_:
+        assert droop.value == pytest.approx(-1.0)
+
+
+@pytest.mark.parametrize(("gap_s", "measured_"), [(0.19, True), (0.21, False)])
+def test_a_gap_of_a_fifth_of_a_second_is_too_long(gap_s: float, measured_: bool) -> None:
+    t = np.concatenate([np.arange(0.0, 1.0, 0.01), np.arange(0.99 + gap_s, 3.0, 0.01)])
+    assert (step(t, A * np.ones_like(t))[0].value is not None) is measured_
+
+
+@pytest.mark.parametrize(("samples", "measured_"), [(7, False), (8, True)])
+def test_eight_samples_are_enough(samples: int, measured_: bool) -> None:
+    t = np.arange(samples) * 0.1
+    metrics = step(t, A * np.ones_like(t), hold=samples * 0.1)
+    assert (metrics[0].value is not None) is measured_
+
+
+def test_a_lag_is_looked_for_up_to_a_second() -> None:
+    t = np.arange(0.0, 20.0, 0.02)
+    phi_sp = A * np.sign(np.sin(0.7 * t))
+
+    def lagging(lag_s: float) -> dict[str, Metric]:
+        phi = A * np.sign(np.sin(0.7 * (t - lag_s)))
+        return {one.name: one for one in track_metrics(t, phi, phi_sp, start_s=0.0, end_s=20.0)}
+
+    assert lagging(0.9)["lag_s"].value == pytest.approx(0.9, abs=0.02)
+    assert lagging(1.2)["lag_s"].reason == "the lag exceeds 1 s"
+    assert lagging(1.2)["vaf_lag_removed_pct"].reason == "the lag exceeds 1 s"
+    assert lagging(1.2)["vaf_pct"].value is not None
+
+
+@pytest.mark.parametrize(("std_deg", "moves"), [(0.49, False), (0.51, True)])
+def test_a_set_point_that_moves_by_half_a_degree_excites(std_deg: float, moves: bool) -> None:
+    t = np.arange(0.0, 10.0, 0.02)
+    phi_sp = math.radians(std_deg) * math.sqrt(2.0) * np.sin(2.0 * math.pi * t)
+    assert (track_metrics(t, phi_sp, phi_sp, start_s=0.0, end_s=10.0)[0].value is not None) is moves
+
+
+def test_two_motor_commands_are_an_effort_and_one_is_none() -> None:
+    t, delta = np.arange(0.0, 1.0, 0.1), np.full(10, math.nan)
+    delta[3] = 0.2
+    assert effort_metrics(t, delta, start_s=0.0, end_s=1.0)[0].value is None
+    delta[4] = -0.2
+    assert values(effort_metrics(t, delta, start_s=0.0, end_s=1.0)) == {
+        "peak_delta_lat": 0.2, "rms_delta_lat": pytest.approx(0.2),
+    }  # fmt: skip
 
 
 def test_tracking_refuses_without_excitation_or_correlation() -> None:
