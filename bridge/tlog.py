@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 import struct
+from io import BufferedWriter
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from bridge.behind_file import BehindFile
 from sitl.errors import FileError
 
 # 1 January 2020 UTC. Simulated flights start here, on whatever day they are flown: same seed, same file.
@@ -27,7 +29,8 @@ class TlogWriter:
     Args:
         path: the file, overwritten if it exists.
         epoch_us: added to every time: SIMULATED_EPOCH_US where times are vehicle time, 0 where they are UTC.
-        waits_s: how long a frame may wait for others, s: with the next one after that, all are written.
+        waits_s: how long a frame may wait for others, s: with the next one after that, all are written, by a thread:
+            who flies by the clock does not wait for a disk.
 
     Raises:
         FileError: the file cannot be written (from `write` and `close` too, on a full disk).
@@ -40,8 +43,9 @@ class TlogWriter:
         self._written = 0
         self._times_us: list[int] = []
         self._frames: list[bytes] = []
+        self._file: BehindFile | BufferedWriter
         try:
-            self._file = self.path.open("wb")
+            self._file = BehindFile(self.path) if math.isfinite(waits_s) else self.path.open("wb")
         except OSError as error:
             raise self._unwritable(error) from None
 
@@ -75,7 +79,8 @@ class TlogWriter:
         data = b"".join([part for pair in zip(stamps, frames, strict=True) for part in pair])
         try:
             self._file.write(data)
-            self._file.flush()
+            if not isinstance(self._file, BehindFile):
+                self._file.flush()
         except OSError as error:
             raise self._unwritable(error) from None
 
@@ -92,7 +97,8 @@ class TlogWriter:
         try:
             self._file.close()
         except OSError as error:
-            self._file.raw.close()  # a full disk fails the flush, and the file would stay open
+            if not isinstance(self._file, BehindFile):
+                self._file.raw.close()  # a full disk fails the flush, and the file would stay open
             raise self._unwritable(error) from None
 
     def __enter__(self) -> Self:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import threading
+import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from bridge import behind_file
 from bridge.connection import Connection
 from bridge.tlog import SIMULATED_EPOCH_US, TlogWriter
 from sitl.errors import FileError
@@ -49,8 +55,76 @@ def test_frames_wait_no_longer_than_they_may(tmp_path: Path) -> None:
     with TlogWriter(path, waits_s=0.06) as log:
         for time_us in range(0, 1_000_000, 4000):
             log.write(time_us, b"\xfdframe")
-            assert time_us / 4000 + 1 - path.stat().st_size / 14 <= 15
+            until = time.monotonic() + 10.0  # a thread writes them
+            while time_us / 4000 + 1 - path.stat().st_size / 14 > 15:
+                assert time.monotonic() < until
     assert path.stat().st_size == 250 * 14
+
+
+class Slow:
+    """A disk on which every write takes a while, and some fail."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.goes_on = threading.Event()
+        self.error: OSError | None = None
+        opened = Path.open
+
+        def slow_open(path: Path, *how: Any, **more: Any) -> Any:
+            file = opened(path, *how, **more)
+            if "wb" not in how:
+                return file
+
+            def write(data: Any) -> Any:
+                self.goes_on.wait(20.0)
+                if self.error is not None:
+                    raise self.error
+                return file.write(data[:1000])
+
+            return SimpleNamespace(write=write, close=file.close)
+
+        monkeypatch.setattr(Path, "open", slow_open)
+
+
+class TestSlowDisk:
+    def test_nobody_waits_for_it_and_nothing_is_lost(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        disk, path = Slow(monkeypatch), tmp_path / "a.tlog"
+        log = TlogWriter(path, waits_s=0.06, epoch_us=0)
+        start = time.monotonic()
+        for time_us in range(0, 10_000_000, 4000):
+            log.write(time_us, b"\xfdframe")
+        assert time.monotonic() - start < 10.0  # a fraction of a second where nothing else runs
+        assert path.stat().st_size == 0
+        disk.goes_on.set()
+        log.close()
+        stamps = range(0, 10_000_000, 4000)
+        assert path.read_bytes() == b"".join(one.to_bytes(8, "big") + b"\xfdframe" for one in stamps)
+
+    def test_what_went_wrong_is_told_at_the_next_write(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        disk = Slow(monkeypatch)
+        log = TlogWriter(tmp_path / "a.tlog", waits_s=0.06)
+        log.write(0, b"\xfdframe")
+        log.flush()
+        disk.error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        disk.goes_on.set()
+        with pytest.raises(FileError, match="No space left on device"):
+            log.close()
+        log.close()
+
+    def test_one_that_stands_still_is_given_up(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(behind_file, "PATIENCE_S", 0.1)
+        monkeypatch.setattr(behind_file, "MOST_WAITING_BYTES", 1000)
+        disk = Slow(monkeypatch)
+        log = TlogWriter(tmp_path / "a.tlog", waits_s=0.06)
+
+        def write() -> None:
+            for time_us in range(0, 10_000_000, 4000):
+                log.write(time_us, b"\xfdframe")
+
+        with pytest.raises(FileError, match="the disk takes nothing"):
+            write()
+        with pytest.raises(FileError, match="the disk takes nothing"):
+            log.close()
+        disk.goes_on.set()
 
 
 def test_simulated_flights_make_the_same_file_on_any_day(tmp_path: Path) -> None:

@@ -400,6 +400,41 @@ class TestFullDisk:
         assert "2.2 ANT-X" in out
 
 
+SLOW_DISK = """
+import os, sys, time
+from bridge import behind_file
+synced, closing = os.fsync, behind_file.contextlib.closing
+
+class Slow:
+    def __init__(self, file): self.file = file
+    def write(self, data): time.sleep(0.4); return self.file.write(data)
+    def close(self): self.file.close()
+
+behind_file.contextlib = type("slow", (), {"closing": staticmethod(lambda file: closing(Slow(file)))})
+os.fsync = lambda handle: (time.sleep(0.4), synced(handle))[1]
+from scenarios.cli import main
+sys.exit(main())
+"""
+"""The program where the disk needs 0.4 s for whatever it is asked: longer than a vehicle waits for its set-points."""
+
+
+class TestSlowDisk:
+    def test_over_udp_the_flight_does_not_wait_for_it(self, serve: Any, quick: Path, tmp_path: Path) -> None:
+        port = free_port()
+        serve(port)
+        before = read(port)
+        words = ("fly", quick, "--connect", f"udpin://127.0.0.1:{port}", "--out", tmp_path, "--json")
+        command = [sys.executable, "-c", SLOW_DISK, *map(str, words)]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        status, out, err = ended(subprocess.Popen(command, cwd=ROOT, text=True, **pipes))  # type: ignore[call-overload]
+        assert (status, err) == (0, [])
+        told = json.loads(out)
+        assert [flight["outcome"] for flight in told["flights"]] == ["PASS", "FAIL"]
+        assert read(port) == before
+        (folder,) = tmp_path.glob("2*")
+        assert min(frames(path) for path in folder.glob("flights/*.tlog")) > 1000
+
+
 class TestInterrupts:
     """The order of things when Ctrl-C comes while something must be finished."""
 
