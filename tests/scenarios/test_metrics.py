@@ -162,6 +162,20 @@ def test_dominant_frequency_of_one_second(hertz: float, uneven: bool) -> None:
         assert dominant_frequency(t, signal) == pytest.approx(hertz, abs=0.1)
 
 
+@pytest.mark.parametrize("hertz", [0.61, 2.03, 5.317, 8.4137, 16.43, 35.6])
+def test_frequency_of_a_pure_sine_is_good_to_a_thousandth(hertz: float) -> None:
+    t = 7.0 + np.arange(0, 1, 0.004)
+    for phase in (0.0, 1.0, 2.5, 4.0):
+        assert dominant_frequency(t, np.sin(2 * math.pi * hertz * t + phase)) == pytest.approx(hertz, abs=6e-4)
+
+
+@pytest.mark.parametrize("hole", [(2.0, 2.25), (2.4, 2.65), (2.75, 3.0)])
+def test_an_oscillation_is_not_measured_over_a_hole(hole: tuple[float, float]) -> None:
+    keep = (hole[0] > T) | (hole[1] < T)
+    shake = oscillation(T[keep], T[keep], T[keep], T[keep], start_s=0.0, end_s=3.0)
+    assert shake.reason.startswith("a gap of 0.2")
+
+
 def test_oscillation_finds_the_axis_and_amplitude() -> None:
     shake = oscillation(T, 0.01 * np.sin(40 * T), 2.0 * np.sin(2 * math.pi * 21.2 * T), 0 * T, start_s=0, end_s=3)
     assert shake.axis == "pitch"
