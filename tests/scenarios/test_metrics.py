@@ -263,6 +263,18 @@ def test_a_step_that_jumps_is_there_at_once() -> None:
     }
 
 
+def test_a_rise_that_began_before_is_counted_from_the_step_on() -> None:
+    # half way there at 0 s, 90 % at 0.8 s
+    assert values(step(T, A * (0.5 + 0.5 * np.clip(T, 0.0, 1.0))))["rise_time_s"] == pytest.approx(0.8, abs=1e-6)
+
+
+def test_settling_ends_between_the_last_sample_outside_and_the_next() -> None:
+    t = np.arange(0.0, 3.0, 0.1)
+    got = values(step(t, np.where(t < 0.95, 0.8 * A, A)))  # 80 % at 0.9 s, there at 1.0 s
+    assert got["settling_time_5pct_s"] == pytest.approx(0.975)
+    assert got["settling_time_2pct_s"] == pytest.approx(0.99)
+
+
 def test_a_set_point_that_does_not_step() -> None:
     metrics = step(T, 0 * T, amplitude=0.0)
     assert len(metrics) == 5
@@ -303,6 +315,14 @@ def test_a_lag_is_looked_for_up_to_a_second() -> None:
     assert lagging(1.2)["lag_s"].reason == "the lag exceeds 1 s"
     assert lagging(1.2)["vaf_lag_removed_pct"].reason == "the lag exceeds 1 s"
     assert lagging(1.2)["vaf_pct"].value is not None
+
+
+def test_a_standing_error_does_not_hide_the_lag() -> None:
+    t = np.arange(0, 20, 0.004)
+    phi = 2.0 * A + A * np.sin(math.pi * (t - 0.1))
+    assert values(track_metrics(t, phi, A * np.sin(math.pi * t), start_s=0, end_s=20))["lag_s"] == pytest.approx(
+        0.1, abs=2e-3
+    )
 
 
 @pytest.mark.parametrize(("std_deg", "moves"), [(0.49, False), (0.51, True)])
