@@ -117,7 +117,7 @@ def changes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
             yield "swapped", altered(args=[test, no, yes])
         case ast.If(test=test) | ast.IfExp(test=test) | ast.While(test=test) if not isinstance(test, ast.Compare):
             yield "negated", altered(test=negated(test))
-        case ast.Return(value=ast.expr()):
+        case ast.Return(value=ast.expr() as value) if not isinstance(value, ast.Constant) or value.value is not None:
             yield "None", altered(value=ast.Constant(None))
         case ast.Expr(value=value) if not isinstance(value, ast.Constant):
             yield "dropped", ast.Pass()
