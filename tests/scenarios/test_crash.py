@@ -400,6 +400,43 @@ class TestFullDisk:
         assert "2.2 ANT-X" in out
 
 
+class TestReadOnlyDisk:
+    @pytest.mark.parametrize("words", [("fly", "demo"), ("sweep", "roll_gains")])
+    def test_nothing_is_begun(self, small_disk: Path, words: tuple[str, ...]) -> None:
+        remount = ["mount", "-o", "remount,ro", str(small_disk)]
+        if subprocess.run(remount, capture_output=True, check=False).returncode:
+            pytest.skip("cannot make a disk read-only here")
+        status, out, (line,) = ended(froude(*words, "--out", small_disk / "runs"))
+        assert (status, out) == (2, "")
+        assert "Read-only file system" in line
+        assert line.endswith("Choose another folder with --out")
+
+    def test_a_vehicle_flies_without_its_file_and_its_log(self, small_disk: Path, quick: Path, tmp_path: Path) -> None:
+        """A flight changes parameters and arms: what cannot be kept is told, and nothing else comes of it."""
+        remount = ["mount", "-o", "remount,ro", str(small_disk)]
+        if subprocess.run(remount, capture_output=True, check=False).returncode:
+            pytest.skip("cannot make a disk read-only here")
+        port = free_port()
+        url = f"udpout://127.0.0.1:{port}#onboard"
+        files = ("--state", small_disk / "vehicle.params", "--log-dir", small_disk)
+        vehicle = froude("sitl", "ant-x", *files, "--speed", 3, "--link", url)
+        try:
+            assert vehicle.stdout is not None
+            assert "serving" in vehicle.stdout.readline()
+            words = ("--connect", f"udpin://127.0.0.1:{port}", "--out", tmp_path / "runs", "--json")
+            status, out, err = ended(froude("fly", quick, *words))
+            assert (status, err) == (0, [])
+        finally:
+            vehicle.terminate()
+            ended(vehicle)
+        flights = json.loads(out)["flights"]
+        told = [flight["reason"] for flight in flights]
+        assert [flight["outcome"] for flight in flights] == ["PASS", "FAIL"], told
+        said = [event["text"] for flight in flights for event in flight["events"]]
+        for what in ("parameters cannot be written (Read-only file system)", "Logging stopped: "):
+            assert [text for text in said if what in text], said
+
+
 SLOW_DISK = """
 import os, sys, time
 from bridge import behind_file
