@@ -16,6 +16,7 @@ import copy
 import inspect
 import os
 import random
+import re
 import resource
 import sys
 import tempfile
@@ -210,8 +211,8 @@ class Hunt:
     """Collects the tests of one file, then lets every mutant run them.
 
     Args:
-        file: the file to change. limit: most mutants, 0 for all. seed: of the choice among them. only: a text that a
-            mutant's description must contain.
+        file: the file to change. limit: most mutants, 0 for all. seed: of the choice among them. only: a pattern that a
+            mutant's line must match.
     """
 
     def __init__(self, file: str, limit: int, seed: int, only: str) -> None:
@@ -230,7 +231,9 @@ class Hunt:
         print(f"\n{self.file}: {len(items)} tests pass in {time.perf_counter() - began[1]:.1f} s", flush=True)
         for nodeid in failing:
             print(f"  left out, fails as it is without the compiler: {nodeid}")
-        found = [one for one in mutants((ROOT / self.file).read_text()) if self.only in f"{self.file}:{one[0]}"]
+        found = [
+            one for one in mutants((ROOT / self.file).read_text()) if re.search(self.only, f"{self.file}:{one[0]}")
+        ]
         if 0 < self.limit < len(found):
             found = sorted(random.Random(self.seed).sample(found, self.limit), key=found.index)
         for what, tree in found:
@@ -285,7 +288,7 @@ def main() -> None:
     )
     parser.add_argument("--sample", type=int, default=0, metavar="N", help="at most N mutants of each file; 0: all")
     parser.add_argument("--seed", type=int, default=1, help="of the choice")
-    parser.add_argument("--only", default="", metavar="TEXT", help="mutants whose line as printed has this in it")
+    parser.add_argument("--only", default="", metavar="REGEX", help="mutants whose line, as printed, it matches")
     args = parser.parse_args()
     os.chdir(ROOT)
     # the same examples for every mutant, none kept, and a failing one is not made smaller
