@@ -317,6 +317,12 @@ def test_a_lag_is_looked_for_up_to_a_second() -> None:
     assert lagging(1.2)["vaf_pct"].value is not None
 
 
+def test_a_lag_is_looked_for_up_to_a_quarter_of_a_short_window() -> None:
+    t = np.arange(0.0, 2.0, 0.004)
+    metrics = track_metrics(t, A * np.sin(math.pi * (t - 0.7)), A * np.sin(math.pi * t), start_s=0.0, end_s=2.0)
+    assert metrics[2].reason == "the lag exceeds 0.5 s"
+
+
 def test_a_standing_error_does_not_hide_the_lag() -> None:
     t = np.arange(0, 20, 0.004)
     phi = 2.0 * A + A * np.sin(math.pi * (t - 0.1))
