@@ -323,6 +323,13 @@ def test_a_lag_is_looked_for_up_to_a_quarter_of_a_short_window() -> None:
     assert metrics[2].reason == "the lag exceeds 0.5 s"
 
 
+@pytest.mark.parametrize("lag_s", [0.0537, 0.0563, 0.0599])
+def test_a_lag_is_found_between_two_samples(lag_s: float) -> None:
+    t, w = np.arange(0.0, 60.0, 0.01), 4.0 * math.pi
+    metrics = track_metrics(t, A * np.sin(w * (t - lag_s)), A * np.sin(w * t), start_s=0.0, end_s=60.0)
+    assert metrics[2].value == pytest.approx(lag_s, abs=5e-4)
+
+
 def test_a_standing_error_does_not_hide_the_lag() -> None:
     t = np.arange(0, 20, 0.004)
     phi = 2.0 * A + A * np.sin(math.pi * (t - 0.1))
