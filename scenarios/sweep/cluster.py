@@ -254,9 +254,12 @@ def _work(plan: Plan, task: Task, make: Callable[[Plan], Rows], theirs: dict[str
 @contextlib.contextmanager
 def _local_cluster(workers: int) -> Iterator[Any]:
     """Worker processes below this one, for as long as this lasts."""
+    import dask
     from distributed import LocalCluster
 
-    with apart():  # the threads that will start others are started here, too
+    # Nobody looks at the profile that every worker would take of itself a hundred times a second. The threads that will
+    # start others later are started in this block, too.
+    with dask.config.set({"distributed.worker.profile.enabled": False}), apart():
         cluster = LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
