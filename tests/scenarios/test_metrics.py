@@ -355,6 +355,13 @@ def test_two_motor_commands_are_an_effort_and_one_is_none() -> None:
     }  # fmt: skip
 
 
+def test_a_window_has_the_sample_at_its_start_and_not_the_one_at_its_end() -> None:
+    t, delta = np.arange(0.0, 3.0, 0.125), np.zeros(24)
+    delta[[7, 16]] = 5.0  # at 0.875 s and at 2.0 s
+    delta[8] = 0.5
+    assert effort_metrics(t, delta, start_s=1.0, end_s=2.0)[0].value == 0.5
+
+
 def test_tracking_refuses_without_excitation_or_correlation() -> None:
     t = np.arange(0, 5, 0.02)
     still = {m.name: m for m in track_metrics(t, 0 * t + 0.1, 0 * t, start_s=0, end_s=5)}
