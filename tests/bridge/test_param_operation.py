@@ -16,9 +16,9 @@ def reads(*indices: int) -> list[tuple[str, dict[str, object]]]:
     return [("PARAM_REQUEST_READ", {**TARGET, "param_id": "", "param_index": index}) for index in indices]
 
 
-def begun(count: int, came: int, *, now_us: int = 0, window: int = 10) -> ParamList:
+def begun(count: int, came: int, *, now_us: int = 0) -> ParamList:
     """A reading that was asked for at 0 and of whose `count` values the first `came` have come."""
-    reading = ParamList(3, 1, window=window)
+    reading = ParamList(3, 1)
     assert reading.poll(0) == WHOLE
     for index in range(came):
         reading.heard(index, f"P{index}", VALUE, count, now_us)
