@@ -34,6 +34,8 @@ LINGER_US: Final = 1_000_000
 """Time a log goes on after it is not wanted any more, us."""
 CHECK_US: Final = 10_000
 """Time between two looks at the slow topics, us."""
+MOST_FLUSH_US: Final = 1_000_000
+"""The same of a vehicle that flies faster than time: its tenth of a second holds more flight."""
 MAX_TEXTS: Final = 64
 """Texts kept per second; further ones are dropped."""
 TEXTS_US: Final = 1_000_000
@@ -66,6 +68,7 @@ class FlightLog:
         utc_boot_us: UTC at vehicle time 0, us; 0 for unknown. No other clock is asked.
         max_total_bytes: most bytes of logs below the directory; the oldest are deleted. A single file is ended and the
             next begun at a quarter of it.
+        flush_us: flight that one write carries, us.
         say: takes texts for people.
         sticks: the pilot's sticks, None while there are none.
         facts: further information for the file, such as the name of the airframe; texts by key.
@@ -84,6 +87,7 @@ class FlightLog:
         system_id: int = 1,
         utc_boot_us: int = 0,
         max_total_bytes: int = MAX_TOTAL_BYTES,
+        flush_us: int = FLUSH_US,
         say: Callable[[Severity, str], None] = lambda severity, text: None,
         sticks: Callable[[], Sticks | None] = lambda: None,
         facts: Mapping[str, str] | None = None,
@@ -97,6 +101,7 @@ class FlightLog:
         self._parameters: ParameterTable = vehicle.parameters
         self._system_id = system_id
         self._utc_boot_us = max(utc_boot_us, 0)
+        self._flush_every_us = flush_us
         self._file_bytes = max(max_total_bytes // 4, MIN_FILE_BYTES)
         self._total_bytes = max(max_total_bytes - self._file_bytes, 0)
         self._say = say
@@ -201,7 +206,7 @@ class FlightLog:
             self._unwanted_us = now_us
         ended = self._unwanted_us is not None and now_us - self._unwanted_us >= LINGER_US
         if ended or now_us >= self._flush_us or ring.full:
-            self._flush_us = now_us + FLUSH_US
+            self._flush_us = now_us + self._flush_every_us
             self._flush(ring)
             if now_us >= self._texts_us:
                 self._texts, self._texts_us = 0, now_us + TEXTS_US
@@ -229,7 +234,7 @@ class FlightLog:
             self._fail(error)
             return
         self._made += 1
-        ring = Ring(vehicle, profile, FLUSH_US // vehicle.tick_us + 2)
+        ring = Ring(vehicle, profile, self._flush_every_us // vehicle.tick_us + 2)
         topics = StateTopics(
             vehicle,
             system_id=self._system_id,
@@ -243,7 +248,7 @@ class FlightLog:
         self._revision = self._parameters.revision
         self._slow = [_Due(topic, number) for number, topic in enumerate(topics, start=first_slow)]
         self._size = self._texts = 0
-        self._check_us, self._flush_us, self._texts_us = 0, now_us + FLUSH_US, now_us + TEXTS_US
+        self._check_us, self._flush_us, self._texts_us = 0, now_us + self._flush_every_us, now_us + TEXTS_US
         self._check_period_us = 0 if profile & Profile.HIGH_RATE else CHECK_US
         self._unwanted_us = None
         self._waiting = [

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 from bridge.component_metadata import ComponentMetadata
 from bridge.event_list import events_json
 from bridge.events import EventServer
-from bridge.flight_log import FlightLog
+from bridge.flight_log import FLUSH_US, FlightLog
 from bridge.ftp import FtpServer
 from bridge.ftp_files import FileTree
 from bridge.key_file import load_key
@@ -67,11 +67,13 @@ class VehicleFiles:
 
     Attributes:
         logs: folder of its ULog files. parameters: what differs from the defaults. signing_key: MAVLink 2 signing.
+        log_flush_us: flight that one write to a ULog carries, us.
     """
 
     logs: Path | None = None
     parameters: Path | None = None
     signing_key: Path | None = None
+    log_flush_us: int = FLUSH_US
 
 
 class Services:
@@ -147,6 +149,7 @@ class Services:
                 vehicle,
                 system_id=sysid,
                 utc_boot_us=utc_boot_us,
+                flush_us=files.log_flush_us,
                 say=say,
                 sticks=lambda: vehicle.autopilot.manual.sticks,
             )

@@ -18,6 +18,7 @@ from pathlib import Path
 from bridge.clock import Clock, ScaledClock, utc_us
 from bridge.fleet import Fleet, stop_on_signals
 from bridge.fleet_status import FleetStatus
+from bridge.flight_log import FLUSH_US, MOST_FLUSH_US
 from bridge.key_file import load_key
 from bridge.link import LOOPBACK
 from bridge.services import VehicleFiles
@@ -63,6 +64,7 @@ class SitlOptions:
         log_dir: folder of flight logs; None writes none.
         signing_key: file of the MAVLink 2 signing key, the same for all vehicles; None does not sign.
         several: whether there is more than one vehicle, so that each needs files of its own.
+        speed: vehicle seconds per second; None for as fast as possible.
     """
 
     profile: str = "sitl"
@@ -74,6 +76,7 @@ class SitlOptions:
     log_dir: Path | None = None
     signing_key: Path | None = None
     several: bool = False
+    speed: float | None = 1.0
 
     def of_instance(self, instance: int) -> SitlOptions:
         """Return the options of one vehicle: its own seed, link addresses and, among several, files.
@@ -155,7 +158,9 @@ def build_vehicle(spec: str | VehicleModel, instance: int, options: SitlOptions)
     table = ParameterTable({**airframe_parameters(model, profile), "MAV_SYS_ID": instance + 1})
     vehicle = Vehicle(model, profile, seed=own.seed, parameters=table)
     links = open_links(own.links, instance=instance)
-    files = VehicleFiles(logs=own.log_dir, parameters=own.state, signing_key=own.signing_key)
+    # of the clock's time, a tenth of a second is what a killed program may lose
+    flush_us = MOST_FLUSH_US if own.speed is None else min(max(FLUSH_US, round(FLUSH_US * own.speed)), MOST_FLUSH_US)
+    files = VehicleFiles(own.log_dir, own.state, own.signing_key, flush_us)
     try:
         return _server(vehicle, links, files)
     except BaseException:

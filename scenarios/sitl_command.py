@@ -77,6 +77,7 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
 
     specs = expand_specs(args.spec)
     sitl_links.check_instances(args.instance, len(specs))
+    clock = _clock(args.speed)
     options = SitlOptions(
         profile=args.profile or "sitl",
         scaling=scaling,
@@ -87,11 +88,11 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
         log_dir=None if args.no_log else args.log_dir or Path(LOGS),
         signing_key=args.signing_key,
         several=len(specs) > 1,
+        speed=None if clock is None else clock.speed,
     )
     sitl_links.check_links(options.links, bind=options.bind, count=len(specs))
     # where nobody said that logs should go, a folder that cannot be written costs the logs and nothing else
     check_files(options if args.log_dir else dataclasses.replace(options, log_dir=None))
-    _clock(args.speed)
     models = {spec: resolve_vehicle(spec, scaling) for spec in dict.fromkeys(specs)}
     if not is_warm():
         tell("compiling the control laws, once; up to half a minute ...")

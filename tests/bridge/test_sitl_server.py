@@ -393,3 +393,20 @@ class TestBuild:
             with pytest.raises(PortBusy, match=rf"instance [01]: 127.0.0.1:{busy.port} "):
                 build_fleet(["ant-x", "ant-x"], 0, options)
             UdpLink.listen("127.0.0.1", free).close()
+
+
+@pytest.mark.parametrize(
+    ("speed", "flush_us"), [(0.5, 80_000), (1.0, 80_000), (4.0, 320_000), (50.0, 1_000_000), (None, 1_000_000)]
+)
+def test_a_log_is_written_every_tenth_of_a_second_of_the_clock(
+    speed: float | None, flush_us: int, tmp_path: Path
+) -> None:
+    options = SitlOptions(links=("udpout://127.0.0.1:19",), log_dir=tmp_path, speed=speed)
+    server = build_vehicle("ant-x", 0, options)
+    try:
+        assert server.services.log is not None
+        server.services.log.tick()
+        assert server.services.log._flush_every_us == flush_us
+    finally:
+        server.close()
+        close_links(server.links)
