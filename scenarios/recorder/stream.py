@@ -6,6 +6,7 @@ the file as soon as the receiver is slow or gone. Who looks on is served by anot
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 from collections.abc import Mapping, Sequence
@@ -189,6 +190,9 @@ class FileRecording(Recording):
         except RuntimeError as error:
             raise FileError(path, f"cannot be written: {error}", "Choose another folder with --out") from error
         super().__init__(stream, name)
+        # in the file before anything else: one that is cut off anywhere still says whose it is
+        with contextlib.suppress(RuntimeError):
+            stream.flush(timeout_sec=FLUSH_PATIENCE_S)
 
     def finish(self) -> Path:
         """Write everything and give the file its name.

@@ -257,7 +257,8 @@ def _of_roll(settings: npt.NDArray[np.void]) -> bytes:
         rest[name][1:] = 0.0
     for name in _OF_YAW:
         rest[name] = 0.0
-    return bytes(rest.tobytes())
+    # field by field: what lies between the fields of a record is not ours
+    return b"".join(np.asarray(rest[name]).tobytes() for name in rest.dtype.names or ())
 
 
 def _acts(sweep: Sweep, case: Case, low: Mapping[str, float], high: Mapping[str, float]) -> bool:

@@ -67,7 +67,10 @@ def told(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, Any]:
     return status, json.loads(capsys.readouterr().out)
 
 
-def test_the_table_says_what_the_ranking_says(shown: Path, undrawn: None, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_table_says_what_the_ranking_says(
+    shown: Path, undrawn: None, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "120")
     ranking = rank(stored_sweep(shown))
     assert cli.main(["sweep", "--show", str(shown)]) == 0
     text = capsys.readouterr().out
