@@ -30,10 +30,8 @@ from scenarios.journal_text import JournalEntry, Owner
 from scenarios.one_flight import FlightStoppedError, fly
 from scenarios.param_journal import SUFFIX, ParamJournal, pending, state_folder
 from sitl.errors import FileError
-
-sys.path.insert(0, str(Path(__file__).parent))  # a module beside the tests that is no test
-
-from elsewhere import URL, Elsewhere, dies_in, elsewhere, vehicles
+from tests.scenarios.elsewhere import URL, Elsewhere, dies_in, elsewhere, vehicles
+from tests.scenarios.striking import flying
 
 __all__ = ["elsewhere", "vehicles"]
 
@@ -52,9 +50,12 @@ timeout_s = 2.0
 [[manoeuvre]]
 kind = "step"
 amplitude_deg = 10.0
-hold_s = 20.0
+hold_s = 300.0
 return_s = 2.0
 """
+
+HOLD = 5
+"""COM_OBL_RC_ACT: a vehicle that nobody flies any more stays where it is, until somebody asks."""
 
 Froude = Callable[..., tuple[int, str, str]]
 
@@ -370,7 +371,7 @@ def port() -> Iterator[int]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         number: int = probe.getsockname()[1]
-    process = start("sitl", "ant-x", "--no-log", "--speed", 8, "--link", f"udpout://127.0.0.1:{number}#onboard")
+    process = start("sitl", "ant-x", "--no-log", "--speed", 4, "--link", f"udpout://127.0.0.1:{number}#onboard")
     assert process.stdout is not None
     assert "serving" in process.stdout.readline()
     yield number
@@ -400,6 +401,7 @@ def in_flight(port: int, tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str]
 
     def prepare(client: Client) -> dict[str, ParamValue]:
         client.upload({"MC_PITCHRATE_FF": (ODD_NAN, "REAL32"), "MC_PITCH_P": (5.25, "REAL32")})
+        client.upload({"COM_OBL_RC_ACT": (struct.pack("<i", HOLD), "INT32")})
         return client.read_parameters(["MC_PITCHRATE_FF", "MC_PITCH_P", "MC_ROLL_P", "MC_ROLLRATE_P", "MC_ROLLRATE_I"])
 
     before = over_udp(port, prepare)
@@ -407,7 +409,7 @@ def in_flight(port: int, tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str]
     (tmp_path / "quick.toml").write_text(QUICK)
     words = ("--connect", f"udpin://127.0.0.1:{port}", "--out", tmp_path / "runs")
     process = start("fly", tmp_path / "quick.toml", *words)
-    wait_for(lambda: [log for log in (tmp_path / "runs").glob("*/flights/*.tlog") if log.stat().st_size > 2e5], process)
+    wait_for(lambda: flying(tmp_path / "runs"), process)
     yield process, before
     process.kill()
     process.communicate()
