@@ -12,13 +12,12 @@ Source: PX4 src/modules/logger.
 
 from __future__ import annotations
 
-import contextlib
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
 from bridge import ulog
+from bridge.behind_file import BehindFile, DirectFile
 from bridge.log_store import create_log, make_room, next_session
 from bridge.ulog_preamble import TYPES, information, initial_parameters
 from bridge.ulog_ring import Ring
@@ -69,6 +68,7 @@ class FlightLog:
         max_total_bytes: most bytes of logs below the directory; the oldest are deleted. A single file is ended and the
             next begun at a quarter of it.
         flush_us: flight that one write carries, us.
+        behind: files are written by threads, and the vehicle waits for no disk.
         say: takes texts for people.
         sticks: the pilot's sticks, None while there are none.
         facts: further information for the file, such as the name of the airframe; texts by key.
@@ -88,6 +88,7 @@ class FlightLog:
         utc_boot_us: int = 0,
         max_total_bytes: int = MAX_TOTAL_BYTES,
         flush_us: int = FLUSH_US,
+        behind: bool = False,
         say: Callable[[Severity, str], None] = lambda severity, text: None,
         sticks: Callable[[], Sticks | None] = lambda: None,
         facts: Mapping[str, str] | None = None,
@@ -109,7 +110,9 @@ class FlightLog:
         self._facts = dict(facts or {})
         self._session = ""
         self._made = 0
-        self._file = -1
+        self._open_file: type[DirectFile] | type[BehindFile] = BehindFile if behind else DirectFile
+        self._file: DirectFile | BehindFile | None = None
+        self._ending: list[tuple[Path, DirectFile | BehindFile]] = []
         self._size = 0
         self._ring: Ring | None = None
         self._slow: list[_Due] = []
@@ -127,6 +130,8 @@ class FlightLog:
     def tick(self) -> None:
         """Log the step the vehicle made just now; call it after each one."""
         ring = self._ring
+        if self._ending:
+            self._see_ended()
         if ring is None:
             autopilot = self._autopilot
             if autopilot.armed is self._seen[1] and self._parameters.revision == self._seen[0]:
@@ -157,6 +162,7 @@ class FlightLog:
         if self._ring is not None:
             self._flush(self._ring)
         self._end()
+        self._see_ended(wait=True)
 
     # -- when to log -------------------------------------------------------------------------------------------
 
@@ -229,10 +235,11 @@ class FlightLog:
             make_room(self.directory, most_bytes=self._total_bytes, most_folders=most_folders)
             self._session = self._session or next_session(self.directory)
             utc_us = self._utc_boot_us + now_us if self._utc_boot_us else 0
-            self.path, self._file = create_log(self.directory, self._session, utc_us, earlier=self._made)
+            self.path, number = create_log(self.directory, self._session, utc_us, earlier=self._made)
         except OSError as error:
             self._fail(error)
             return
+        self._file = self._open_file(number)
         self._made += 1
         ring = Ring(vehicle, profile, self._flush_every_us // vehicle.tick_us + 2)
         topics = StateTopics(
@@ -277,32 +284,39 @@ class FlightLog:
 
     def _write(self) -> None:
         """Write all that waits; on failure what is in the file stays, to the last whole message."""
-        data, self._waiting = memoryview(b"".join(self._waiting)), []
+        data, self._waiting = b"".join(self._waiting), []
+        if self._file is None:
+            return
         try:
-            left = data
-            while left:
-                left = left[os.write(self._file, left) :]
+            self._file.write(data)
         except OSError as error:
-            with contextlib.suppress(OSError):  # readers cope with half a message at the end
-                os.ftruncate(self._file, self._size)
             self._fail(error)
             return
         self._size += len(data)
 
     def _end(self) -> None:
-        if self._file >= 0:
-            try:
-                os.close(self._file)
-            except OSError as error:
-                self._file = -1
-                self._fail(error)
-        self._file, self.path, self._ring = -1, None, None
+        path, file = self.path, self._file
+        self._file, self.path, self._ring = None, None, None
         self._slow, self._waiting = [], []
+        if path is not None and file is not None:
+            file.finish()
+            self._ending.append((path, file))
+            self._see_ended()
 
-    def _fail(self, error: OSError) -> None:
+    def _see_ended(self, *, wait: bool = False) -> None:
+        """Let go of files of which all is written, or wait until it is."""
+        for path, file in self._ending[:]:
+            if wait or file.finished:
+                self._ending.remove((path, file))
+                try:
+                    file.close()
+                except OSError as error:
+                    self._fail(error, path)
+
+    def _fail(self, error: OSError, path: Path | None = None) -> None:
         self.failures += 1
         self._blocked = True
-        where = self.path or self.directory
+        where = path or self.path or self.directory
         self._end()
         self._say(
             Severity.ERROR,

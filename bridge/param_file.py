@@ -16,6 +16,7 @@ import contextlib
 import math
 import os
 import re
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -210,20 +211,24 @@ class ParameterFile:
         path: the file; it need not be there yet, its folder must.
         table: the vehicle's parameters. What the file holds is set in it, anything else is left as it is.
         system_id: MAVLink system of the vehicle, written into the file; nothing depends on it when it is read.
+        behind: `poll` has the file written by a thread, and the vehicle waits for no disk.
 
     Attributes:
-        problem: why the last write failed, naming the file; empty if it did not.
+        problem: why the last write failed, naming the file; empty if it did not. failures: writes that failed.
         notices: sentences for a person about what was read.
 
     Raises:
         FileError: the file is damaged or cannot be read. Then nothing has been set or written.
     """
 
-    def __init__(self, path: str | Path, table: ParameterTable, system_id: int = 1) -> None:
+    def __init__(self, path: str | Path, table: ParameterTable, system_id: int = 1, *, behind: bool = False) -> None:
         self.path = Path(os.path.realpath(path))  # a link stays a link
         self.table = table
         self.system_id = system_id
         self.problem = ""
+        self.failures = 0
+        self._behind = behind
+        self._writer: threading.Thread | None = None
         self.notices: tuple[str, ...] = ()
         self._strangers: dict[str, str] = {}
         self._apply(read_parameters(self.path, table))
@@ -253,6 +258,12 @@ class ParameterFile:
         Args:
             now_us: vehicle time, us.
         """
+        if self._writer is not None:
+            if self._writer.is_alive():
+                return
+            self._writer = None
+            if self.problem:
+                self._due_us = now_us + RETRY_US
         if self._revision != self.table.revision:
             self._revision = self.table.revision
             if self._due_us is None:
@@ -260,18 +271,29 @@ class ParameterFile:
         elif self._due_us is None:
             return
         if now_us >= self._due_us:
-            self._saved_us = now_us
-            self._due_us = None if self.save() else now_us + RETRY_US
+            self._saved_us, self._due_us = now_us, None
+            if self._behind:
+                text = self._render()
+                self._writer = threading.Thread(target=self._put, args=(text,), name=f"writes {self.path}", daemon=True)
+                self._writer.start()
+            elif not self.save():
+                self._due_us = now_us + RETRY_US
 
     def save(self) -> bool:
         """Write now, if anything differs from what was written last; returns whether the file is right now."""
-        text = self._render()
+        if self._writer is not None:
+            self._writer.join()
+            self._writer = None
+        return self._put(self._render())
+
+    def _put(self, text: str) -> bool:
         if text == self._text and not self.problem:
             return True
         try:
             self._write(text.encode())
         except OSError as error:
             self.problem = f"{self.path}: parameters cannot be written ({error.strerror}); they are lost at the end"
+            self.failures += 1
             return False
         self.problem = ""
         self._text = text

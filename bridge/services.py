@@ -68,12 +68,14 @@ class VehicleFiles:
     Attributes:
         logs: folder of its ULog files. parameters: what differs from the defaults. signing_key: MAVLink 2 signing.
         log_flush_us: flight that one write to a ULog carries, us.
+        behind: written by threads: the vehicle keeps to the wall clock and waits for no disk.
     """
 
     logs: Path | None = None
     parameters: Path | None = None
     signing_key: Path | None = None
     log_flush_us: int = FLUSH_US
+    behind: bool = False
 
 
 class Services:
@@ -112,7 +114,10 @@ class Services:
         self._say, self._say_at_times = say, say_at_times
         table = vehicle.parameters
         self._corrector = ParameterCorrector(table)
-        self._stored = None if files.parameters is None else ParameterFile(files.parameters, table, sysid)
+        self._stored: ParameterFile | None = None
+        if files.parameters is not None:
+            self._stored = ParameterFile(files.parameters, table, sysid, behind=files.behind)
+        self._failures_told = 0
         if self._stored is not None:
             table.reset("MAV_SYS_ID")  # the links decide, not the file of another instance
             for notice in self._stored.notices:
@@ -150,6 +155,7 @@ class Services:
                 system_id=sysid,
                 utc_boot_us=utc_boot_us,
                 flush_us=files.log_flush_us,
+                behind=files.behind,
                 say=say,
                 sticks=lambda: vehicle.autopilot.manual.sticks,
             )
@@ -172,7 +178,8 @@ class Services:
             self._say(Severity.CRITICAL, text)
         if self._stored is not None:
             self._stored.poll(now_us)
-            if self._stored.problem:
+            if self._stored.failures > self._failures_told:
+                self._failures_told = self._stored.failures
                 self._say_at_times(Severity.CRITICAL, "parameter file", self._stored.problem)
 
     def store(self, action: float) -> Result | None:

@@ -160,7 +160,7 @@ def build_vehicle(spec: str | VehicleModel, instance: int, options: SitlOptions)
     links = open_links(own.links, instance=instance)
     # of the clock's time, a tenth of a second is what a killed program may lose
     flush_us = MOST_FLUSH_US if own.speed is None else min(max(FLUSH_US, round(FLUSH_US * own.speed)), MOST_FLUSH_US)
-    files = VehicleFiles(own.log_dir, own.state, own.signing_key, flush_us)
+    files = VehicleFiles(own.log_dir, own.state, own.signing_key, flush_us, behind=own.speed is not None)
     try:
         return _server(vehicle, links, files)
     except BaseException:

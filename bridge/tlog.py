@@ -7,6 +7,7 @@ wire. No header. MAVProxy, QGroundControl and pymavlink write and read the same.
 from __future__ import annotations
 
 import math
+import os
 import struct
 from io import BufferedWriter
 from pathlib import Path
@@ -45,7 +46,11 @@ class TlogWriter:
         self._frames: list[bytes] = []
         self._file: BehindFile | BufferedWriter
         try:
-            self._file = BehindFile(self.path) if math.isfinite(waits_s) else self.path.open("wb")
+            if math.isfinite(waits_s):
+                how = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | getattr(os, "O_BINARY", 0)
+                self._file = BehindFile(os.open(self.path, how, 0o666))
+            else:
+                self._file = self.path.open("wb")
         except OSError as error:
             raise self._unwritable(error) from None
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -356,27 +358,90 @@ def test_a_directory_that_cannot_be_written_stops_the_log_and_not_the_flight(tmp
     assert one.log.path is not None, "the next arming tries again"
 
 
-def test_a_full_disk_leaves_a_valid_file(tmp_path, monkeypatch):
-    one = Logged(tmp_path)
+class Disk:
+    """Files on it take so many bytes, and none while it stands still."""
+
+    def __init__(self, monkeypatch, room=10**9):
+        self.goes_on, self.room = threading.Event(), room
+        self.goes_on.set()
+
+        def write(file, chunk):
+            assert self.goes_on.wait(60.0)
+            if self.room <= 0:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            done = os.write(file, chunk[: self.room])
+            self.room -= done
+            return done
+
+        monkeypatch.setattr("bridge.behind_file.write", write)
+
+
+def until(condition):
+    for _ in range(6000):
+        if condition():
+            return
+        time.sleep(0.01)
+    pytest.fail("never so")
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_a_full_disk_leaves_a_valid_file(tmp_path, monkeypatch, behind):
+    disk = Disk(monkeypatch)
+    one = Logged(tmp_path, behind=behind)
     one.fly(2.5)
-    write, left = os.write, [1000]
+    until(lambda: one.log.path.stat().st_size > 100_000)  # a thread may have written it
+    disk.room = 1000
 
-    def full(file, chunk):
-        if left[0] <= 0:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        done = write(file, chunk[: left[0]])
-        left[0] -= done
-        return done
+    def told():
+        one.run(0.2)
+        return one.said
 
-    monkeypatch.setattr("bridge.flight_log.os.write", full)
-    one.run(3.0)
-    assert [text for _, text in one.said if "No space left on device" in text]
-    assert len(one.said) == 1
+    until(told)
+    ((severity, text),) = one.said
+    assert severity == Severity.ERROR
+    assert "No space left on device" in text
+    assert str(tmp_path) in text
     assert one.log.path is None
-    ulog = one.read()
-    assert ulog.last_timestamp < one.vehicle.time_us - 2_500_000
     one.log.text(Severity.INFO, "nobody logs this")
     one.log.close()
+    assert len(one.said) == 1
+    ulog = one.read()
+    assert not ulog.file_corruption
+    assert ulog.last_timestamp < one.vehicle.time_us
+
+
+def test_a_disk_that_stands_still_keeps_no_vehicle_waiting_and_nothing_is_lost(tmp_path, monkeypatch):
+    disk = Disk(monkeypatch)
+    one = Logged(tmp_path, behind=True)
+    disk.goes_on.clear()
+    one.fly(4.0)
+    (file,) = tmp_path.rglob("*.ulg")
+    assert file.stat().st_size == 0
+    one.arm(False)
+    one.run(2.0)  # the log has ended, the file has not
+    one.arm()
+    one.run(0.5)
+    assert one.log.path not in (None, file)
+    disk.goes_on.set()
+    one.log.close()
+    assert one.said == []
+    whole, later = sorted(tmp_path.rglob("*.ulg"))
+    assert whole == file
+    times_us = data(ULog(str(whole)), "vehicle_attitude")["timestamp"]
+    assert times_us[-1] - times_us[0] > 3_500_000
+    assert len(data(ULog(str(later)), "vehicle_attitude")["timestamp"]) > 20
+
+
+def test_what_the_disk_did_not_take_at_the_end_is_told_too(tmp_path, monkeypatch):
+    disk = Disk(monkeypatch)
+    one = Logged(tmp_path, behind=True)
+    disk.goes_on.clear()
+    one.fly(1.0)
+    disk.room = 0
+    disk.goes_on.set()
+    one.log.close()
+    assert [text for _, text in one.said if "No space left on device" in text]
+    assert one.log.failures == 1
 
 
 def test_a_log_is_downloaded_while_it_is_written_and_survives_an_erasure(tmp_path):

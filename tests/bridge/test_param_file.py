@@ -6,6 +6,7 @@ import itertools
 import math
 import os
 import struct
+import threading
 from pathlib import Path
 
 import pytest
@@ -201,6 +202,56 @@ def test_a_disk_that_fails_is_told_and_tried_again(tmp_path: Path, monkeypatch: 
     for now_us in range(12 * SECOND_US, 18 * SECOND_US, 4_000):
         file.poll(now_us)
     assert file.problem == ""
+    assert "MC_ROLL_P\t6\t9" in path.read_text()
+
+
+def test_a_disk_that_stands_still_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, table = tmp_path / "state.params", ParameterTable()
+    file = ParameterFile(path, table, behind=True)
+    goes_on, real = threading.Event(), os.fsync
+
+    def slow(descriptor: int) -> None:
+        assert goes_on.wait(60.0)
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", slow)
+    table.set("MC_ROLL_P", 6.0)
+    for now_us in range(0, 2 * SECOND_US, 4_000):
+        file.poll(now_us)
+    table.set("MC_ROLL_P", 7.0)  # while that is written
+    for now_us in range(2 * SECOND_US, 4 * SECOND_US, 4_000):
+        file.poll(now_us)
+    assert not path.exists()
+    goes_on.set()
+    assert file.close()
+    assert "MC_ROLL_P\t7\t9" in path.read_text()
+    assert file.problem == ""
+
+
+def test_a_disk_that_fails_behind_the_vehicle_is_told_once_a_try(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, table = tmp_path / "state.params", ParameterTable()
+    file = ParameterFile(path, table, behind=True)
+    attempts: list[int] = []
+
+    def full(_descriptor: int) -> None:
+        attempts.append(1)
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    table.set("MC_ROLL_P", 6.0)
+    for now_us in range(0, 12 * SECOND_US, 4_000):
+        before = file.failures
+        file.poll(now_us)
+        for thread in threading.enumerate():
+            if thread.name == f"writes {path}":
+                thread.join()
+        assert file.failures - before in (0, 1)
+    assert (len(attempts), file.failures) == (3, 3)
+    assert "No space left on device" in file.problem
+    monkeypatch.undo()
+    assert file.close()
     assert "MC_ROLL_P\t6\t9" in path.read_text()
 
 

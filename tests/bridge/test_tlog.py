@@ -7,7 +7,6 @@ import os
 import threading
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -67,22 +66,14 @@ class Slow:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.goes_on = threading.Event()
         self.error: OSError | None = None
-        opened = Path.open
 
-        def slow_open(path: Path, *how: Any, **more: Any) -> Any:
-            file = opened(path, *how, **more)
-            if "wb" not in how:
-                return file
+        def write(file: int, data: Any) -> int:
+            self.goes_on.wait(20.0)
+            if self.error is not None:
+                raise self.error
+            return os.write(file, data[:1000])
 
-            def write(data: Any) -> Any:
-                self.goes_on.wait(20.0)
-                if self.error is not None:
-                    raise self.error
-                return file.write(data[:1000])
-
-            return SimpleNamespace(write=write, close=file.close)
-
-        monkeypatch.setattr(Path, "open", slow_open)
+        monkeypatch.setattr(behind_file, "write", write)
 
 
 class TestSlowDisk:

@@ -460,14 +460,8 @@ class TestReadOnlyDisk:
 SLOW_DISK = """
 import os, sys, time
 from bridge import behind_file
-synced, closing = os.fsync, behind_file.contextlib.closing
-
-class Slow:
-    def __init__(self, file): self.file = file
-    def write(self, data): time.sleep(0.4); return self.file.write(data)
-    def close(self): self.file.close()
-
-behind_file.contextlib = type("slow", (), {"closing": staticmethod(lambda file: closing(Slow(file)))})
+synced, append = os.fsync, behind_file._append
+behind_file._append = lambda *pieces: (time.sleep(0.4), append(*pieces))
 os.fsync = lambda handle: (time.sleep(0.4), synced(handle))[1]
 from scenarios.cli import main
 sys.exit(main())
