@@ -63,6 +63,7 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
     from sitl.geomagnetism import home_of
     from sitl.profile import get_profile
     from sitl.sensors import ORIGIN
+    from sitl.vehicle import warm_up
     from sitl.vehicle_spec import resolve_vehicle
 
     check_instances(args.instance, 1)
@@ -73,6 +74,7 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
     profile = get_profile(args.profile or "sitl")
     if not is_warm():
         tell("compiling the control laws, once; up to half a minute ...")
+    warm_up(model, profile)
     board = link.startswith("serial")
     # what is served says itself who else can reach it
     asked = [link] * args.check + [_connect_url(args)] * (args.check or args.setup) * (not board)

@@ -73,6 +73,8 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
     )
     from scenarios.status_line import StatusLine
     from sitl.compiled import is_warm
+    from sitl.profile import get_profile
+    from sitl.vehicle import warm_up
     from sitl.vehicle_spec import resolve_vehicle
 
     specs = expand_specs(args.spec)
@@ -96,6 +98,7 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
     models = {spec: resolve_vehicle(spec, scaling) for spec in dict.fromkeys(specs)}
     if not is_warm():
         tell("compiling the control laws, once; up to half a minute ...")
+    warm_up(next(iter(models.values())), get_profile(options.profile))
     servers = build_fleet([models[spec] for spec in specs], args.instance, options)
     screen = StatusLine(always=args.status, tell=tell)
     try:

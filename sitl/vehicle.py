@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from sitl.autopilot import Autopilot
 from sitl.control_settings import mix_of
 from sitl.faults import Faults
+from sitl.filters import constrain
 from sitl.parameters import ParameterTable
 from sitl.plant import Plant
 from sitl.profile import Profile
@@ -16,6 +17,9 @@ from sitl.vehicle_spec import VehicleModel
 
 Vec3 = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
+
+_READY_WITHIN_US = 20_000_000
+_TICKS_IN_FLIGHT = 50
 
 
 @dataclass(frozen=True)
@@ -183,6 +187,26 @@ class Vehicle:
         """A battery that never empties."""
         load = sum(self.autopilot.motors)
         return Battery(voltage_v=(16.2 - 0.05 * load) * self.faults.voltage, current_a=5.0 * load, remaining=1.0)
+
+
+def warm_up(model: VehicleModel, profile: Profile) -> None:
+    """Let another vehicle take off, so that every law is compiled, or loaded, before one flies by a clock.
+
+    A law is compiled when it is first called, for up to ten seconds, and those of the position first when a vehicle is
+    armed: it would stand still then, with its motors on.
+
+    Args:
+        model, profile: of the vehicle that will fly; others need the same laws.
+    """
+    vehicle = Vehicle(model, profile)
+    commander = vehicle.autopilot
+    while not commander.ready and vehicle.time_us < _READY_WITHIN_US:
+        vehicle.step()
+    commander.command_arm(True, force=True)
+    commander.command_takeoff(None)
+    for _ in range(_TICKS_IN_FLIGHT):
+        vehicle.step()
+    constrain(0.0, -1.0, 1.0)  # which the navigator calls by itself, in other modes
 
 
 def airframe_parameters(model: VehicleModel, profile: Profile) -> dict[str, float | int]:

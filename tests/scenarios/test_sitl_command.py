@@ -51,6 +51,7 @@ def ends_soon(monkeypatch: pytest.MonkeyPatch) -> None:
         step(vehicle)
 
     monkeypatch.setattr(Vehicle, "step", interrupted_step)
+    monkeypatch.setattr("sitl.vehicle.warm_up", lambda *_: None)  # the first vehicle would be its own
 
 
 class Ear:

@@ -1,7 +1,11 @@
 from __future__ import annotations
 
+import json
 import math
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +27,7 @@ TABLE_7_2 = {
     "CARRIER-1": FlightGains(12.49, 0.341, 2.21, 1.64e-5),
     "ADAM-0": FlightGains(6.258, 0.225, 0.987, 3.89e-4),
 }
+ROOT = Path(__file__).parents[2]
 AIRFRAMES = ("ant-x", "ant-r", "carrier-1", "adam-0")
 
 
@@ -383,3 +388,37 @@ def test_the_machine_code_is_kept_under_this_version(flight: Any) -> None:
     flight().run(0.01)
     assert is_warm()
     assert cache_folder().name.startswith("laws-")
+
+
+WARM = """
+import json
+from numba.core.dispatcher import Dispatcher
+from sitl.modes import Mode
+from sitl.profile import get_profile
+from sitl.vehicle import Vehicle, warm_up
+from sitl.vehicle_spec import resolve_vehicle
+
+taken, called, compile = [], [], Dispatcher.compile
+Dispatcher.compile = lambda law, types: (taken.append(law.__name__), compile(law, types))[1]
+warm_up(resolve_vehicle("ant-x"), get_profile("sitl"))
+before, taken = taken, []
+vehicle = Vehicle(resolve_vehicle("adam-0"), get_profile("sitl"), seed=3)
+for _ in range(2500):
+    vehicle.step()
+autopilot = vehicle.autopilot
+said = [autopilot.command_arm(True), autopilot.command_takeoff(None)]
+for mode in (Mode.LOITER, Mode.RTL, Mode.LAND):
+    for _ in range(2500):
+        vehicle.step()
+    said.append(autopilot.command_mode(mode))
+print(json.dumps({"before": before, "later": taken, "said": [int(one) for one in said]}))
+"""
+
+
+def test_no_law_is_compiled_or_loaded_in_flight() -> None:
+    """It takes up to ten seconds, in which a vehicle that flies by the clock would stand still."""
+    done = subprocess.run([sys.executable, "-c", WARM], cwd=ROOT, capture_output=True, text=True, check=True)
+    told = json.loads(done.stdout)
+    assert {"control_tick", "plant_tick", "position_tick"} <= set(told["before"])
+    assert told["later"] == []
+    assert told["said"] == [0] * 5
