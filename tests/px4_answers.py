@@ -43,6 +43,9 @@ _ANSWER = re.compile(
 ANSWERS = frozenset(name for name in BY_NAME if _ANSWER.fullmatch(name))
 """Messages that count as answers; of HEARTBEAT those that say something new."""
 
+_LOGS = re.compile('"LOG|FILE_TRANSFER|"logged"|"nolog"|SDLOG|STORAGE_INFORMATION')
+"""What in a case may depend on whether its vehicle writes logs."""
+
 EARLY_S, GRACE_S = 0.05, 0.1
 """An answer so shortly before or after the end of the last step may stand for a recorded one, but need not."""
 
@@ -137,7 +140,7 @@ def replay(case: Json, deviations: Sequence[Deviation] = ()) -> Verdict:
 
 def ask(case: Json, phase_s: float = 0.0) -> Json:
     """What a vehicle just started and brought into the case's state answers, in the form of the recordings."""
-    rig = Rig()
+    rig = Rig(logs=_LOGS.search(json.dumps(case)) is not None)
     station = rig.station(case.get("link"))
     if case.get("kind") == "connect":
         return _connect(rig, station, case)

@@ -183,9 +183,12 @@ class Rig:
     Attributes:
         heartbeats: whether the stations send theirs.
         stream: what is sent again and again, as the recordings' `stream`; {"hold": True} keeps 20 m in Offboard.
+
+    Args:
+        logs: it writes logs. Most cases neither ask for them nor tell of them, and it takes a quarter of their time.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, logs: bool) -> None:
         self.vehicle = Vehicle(resolve_vehicle("ant-x"), get_profile("sitl"))
         near_gcs, far_gcs = MemoryLink.pair()
         near_api, far_api = MemoryLink.pair()
@@ -193,9 +196,11 @@ class Rig:
             ServerLink(near_gcs, Connection(1, 1, datagram=True), 0, "gcs"),
             ServerLink(near_api, Connection(1, 1, datagram=True), 1, "onboard"),
         ]
-        folder = tempfile.mkdtemp()
-        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        files = VehicleFiles(logs=Path(folder))
+        files = VehicleFiles()
+        if logs:
+            folder = tempfile.mkdtemp()
+            weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+            files = VehicleFiles(logs=Path(folder))
         self.server = VehicleServer(self.vehicle, links, utc_boot_us=UTC_BOOT_US, strict=True, files=files)
         self.gcs, self.api = Station(far_gcs, 255), Station(far_api, 245)
         self.heartbeats = True
