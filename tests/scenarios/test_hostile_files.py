@@ -7,7 +7,7 @@ import os
 import struct
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pyarrow as pa
@@ -21,6 +21,7 @@ from sitl.plain_file import LARGEST_TEXT, check_plain
 MEMORY = 4_000_000_000
 """Address space of the process that reads: libraries alone reserve half of it."""
 SECONDS = 120
+END = "-- exit status "
 
 ULOG = b"ULog\x01\x12\x35\x01" + bytes(8)
 FEED = ("fly", "roll_step", "--gains")
@@ -34,20 +35,40 @@ def topics(*layouts: str) -> bytes:
     return b"".join(message("F", one.encode()) for one in layouts) + message("A", b"\0\0\0vehicle_attitude")
 
 
-def froude(folder: Path, *words: str) -> tuple[int, list[str]]:
-    """Status and lines on standard error of a froude with bounded memory and time."""
+def froude(folder: Path, *commands: Sequence[str]) -> list[tuple[int, list[str]]]:
+    """Status and lines on standard error of each command, in one froude with bounded memory and time.
+
+    One process for all: its start takes longer than their refusal.
+    """
     program = (
-        "import resource, sys; "
-        f"resource.setrlimit(resource.RLIMIT_AS, ({MEMORY}, {MEMORY})); "
-        "from scenarios.cli import main; sys.exit(main(sys.argv[1:]))"
+        "import json, resource, sys\n"
+        f"resource.setrlimit(resource.RLIMIT_AS, ({MEMORY}, {MEMORY}))\n"
+        "from scenarios.cli import main\n"
+        "for command in json.loads(sys.argv[1]):\n"
+        "    try: status = main(command)\n"
+        "    except SystemExit as end: status = end.code\n"
+        f"    sys.stderr.write(f'{END}{{status}}\\n')\n"
     )
-    command = [sys.executable, "-c", program, *words]
     root = str(Path(__file__).parents[2])
-    environment = {**os.environ, "PYTHONPATH": root, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=SECONDS, check=False
+        [sys.executable, "-c", program, json.dumps(commands)],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": root, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=SECONDS,
+        check=False,
     )
-    return done.returncode, done.stderr.splitlines()
+    told: list[tuple[int, list[str]]] = []
+    lines: list[str] = []
+    for line in done.stderr.splitlines():
+        if line.startswith(END):
+            told.append((int(line.removeprefix(END)), lines))
+            lines = []
+        else:
+            lines.append(line)
+    assert (done.returncode, lines, len(told)) == (0, [], len(commands)), done.stderr[-2000:]
+    return told
 
 
 def sparse(path: Path, size: int) -> None:
@@ -109,69 +130,87 @@ def test_what_is_no_plain_file_is_refused_before_it_is_read(
         assert name in line, (what, line)
 
 
-@pytest.mark.parametrize(
-    "log",
-    [
-        ULOG + topics("vehicle_attitude:uint64_t timestamp;float[2000000000] q;"),
-        ULOG
-        + topics("vehicle_attitude:uint64_t timestamp;float[65535] q;float[65535] r;float[65535] s;float[65535] t;"),
-        ULOG
-        + topics(
-            "a0:uint8_t[1000] x;",
-            *(f"a{n}:a{n - 1}[1000] x;" for n in range(1, 6)),
-            "vehicle_attitude:uint64_t timestamp;a5 x;",
+LOGS = dict(
+    zip(
+        ("array", "arrays", "nested", "nested nothing", "own loop", "unknown", "appended", "cut", "info", "zeros"),
+        (
+            ULOG + topics("vehicle_attitude:uint64_t timestamp;float[2000000000] q;"),
+            ULOG
+            + topics(
+                "vehicle_attitude:uint64_t timestamp;float[65535] q;float[65535] r;float[65535] s;float[65535] t;"
+            ),
+            ULOG
+            + topics(
+                "a0:uint8_t[1000] x;",
+                *(f"a{n}:a{n - 1}[1000] x;" for n in range(1, 6)),
+                "vehicle_attitude:uint64_t timestamp;a5 x;",
+            ),
+            ULOG
+            + topics(
+                "a0:;", *(f"a{n}:a{n - 1}[60000] x;" for n in range(1, 6)), "vehicle_attitude:uint64_t timestamp;a5 x;"
+            ),
+            ULOG + topics("vehicle_attitude:uint64_t timestamp;vehicle_attitude x;"),
+            ULOG + topics("vehicle_attitude:uint64_t timestamp;nothing x;"),
+            ULOG + message("B", bytes(8) + b"\1" + bytes(7) + struct.pack("<QQQ", 1 << 40, 5, 1 << 63)),
+            ULOG + struct.pack("<HB", 65535, ord("F")) + b"x" * 100,
+            ULOG + message("I", b"\xffchar[99999999] x"),
+            ULOG + bytes(200_000),
         ),
-        ULOG
-        + topics(
-            "a0:;", *(f"a{n}:a{n - 1}[60000] x;" for n in range(1, 6)), "vehicle_attitude:uint64_t timestamp;a5 x;"
-        ),
-        ULOG + topics("vehicle_attitude:uint64_t timestamp;vehicle_attitude x;"),
-        ULOG + topics("vehicle_attitude:uint64_t timestamp;nothing x;"),
-        ULOG + message("B", bytes(8) + b"\1" + bytes(7) + struct.pack("<QQQ", 1 << 40, 5, 1 << 63)),
-        ULOG + struct.pack("<HB", 65535, ord("F")) + b"x" * 100,
-        ULOG + message("I", b"\xffchar[99999999] x"),
-        ULOG + bytes(200_000),
-    ],
-    ids=["array", "arrays", "nested", "nested nothing", "own loop", "unknown", "appended", "cut", "info", "zeros"],
+        strict=True,
+    )
 )
-def test_a_log_that_claims_more_than_there_is(tmp_path: Path, log: bytes) -> None:
-    (tmp_path / "flight.ulg").write_bytes(log)
-    status, lines = froude(tmp_path, "review", "flight.ulg")
-    assert (status, len(lines)) == (2, 1), lines
-    assert "flight.ulg: " in lines[0]
+
+
+def test_logs_that_claim_more_than_there_is(tmp_path: Path) -> None:
+    for number, log in enumerate(LOGS.values()):
+        (tmp_path / f"{number}.ulg").write_bytes(log)
+    told = froude(tmp_path, *(("review", f"{number}.ulg") for number in range(len(LOGS))))
+    for number, (name, (status, lines)) in enumerate(zip(LOGS, told, strict=True)):
+        assert (status, len(lines)) == (2, 1), (name, lines)
+        assert f"{number}.ulg: " in lines[0], name
 
 
 def deep(start: str, end: str, count: int = 100_000) -> str:
     return start * count + end * count
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "x = " + deep("[", "]"),
-        "x = " + deep("{a=", "}"),
-        ".".join(["a"] * 20_000) + " = 1",
-        "x = " + "9" * 100_000,
-        "[[gain_set]]\nname = 'a'\n[gain_set.parameters]\nMC_ROLL_P = " + "9" * 4_000,
-        "[[gain_set]]\nname = 'a'\n[gain_set.parameters]\nMC_ROLL_P = nan",
-        "[[gain_set]]\nname = 'a'\n[gain_set.parameters]\nMC_ROLL_P = -inf",
-        "[[gain_set]]\nname = '" + "a" * 100_000 + "'\n[gain_set.parameters]\nMC_ROLL_P = 1e400",
-        "[[gain_set]]\n" * 50_000,
-    ],
-    ids=["arrays", "tables", "dots", "digits", "huge", "nan", "inf", "long", "many"],
+GAINS = dict(
+    zip(
+        ("arrays", "tables", "dots", "digits", "huge", "nan", "inf", "long", "many"),
+        (
+            "x = " + deep("[", "]"),
+            "x = " + deep("{a=", "}"),
+            ".".join(["a"] * 20_000) + " = 1",
+            "x = " + "9" * 100_000,
+            "[[gain_set]]\nname = 'a'\n[gain_set.parameters]\nMC_ROLL_P = " + "9" * 4_000,
+            "[[gain_set]]\nname = 'a'\n[gain_set.parameters]\nMC_ROLL_P = nan",
+            "[[gain_set]]\nname = 'a'\n[gain_set.parameters]\nMC_ROLL_P = -inf",
+            "[[gain_set]]\nname = '" + "a" * 100_000 + "'\n[gain_set.parameters]\nMC_ROLL_P = 1e400",
+            "[[gain_set]]\n" * 50_000,
+        ),
+        strict=True,
+    )
 )
-def test_gains_that_no_reader_should_choke_on(tmp_path: Path, text: str) -> None:
-    (tmp_path / "gains.toml").write_text(text)
-    status, lines = froude(tmp_path, *FEED, "gains.toml")
-    assert (status, len(lines)) == (2, 1), [line[:300] for line in lines]
-    assert "gains.toml" in lines[0]
 
 
-@pytest.mark.parametrize("value", ["nan", "1e999", "0x1", "1_000", "9" * 5_000, "१२"])
-def test_parameters_of_a_ground_stations_file(tmp_path: Path, value: str) -> None:
-    (tmp_path / "gains.params").write_text(f"1\t1\tMC_ROLL_P\t{value}\t9\n")
-    status, lines = froude(tmp_path, *FEED, "gains.params")
-    assert (status, len(lines)) == (2, 1), [line[:300] for line in lines]
+def test_gains_that_no_reader_should_choke_on(tmp_path: Path) -> None:
+    for number, text in enumerate(GAINS.values()):
+        (tmp_path / f"gains{number}.toml").write_text(text)
+    told = froude(tmp_path, *((*FEED, f"gains{number}.toml") for number in range(len(GAINS))))
+    for number, (name, (status, lines)) in enumerate(zip(GAINS, told, strict=True)):
+        assert (status, len(lines)) == (2, 1), (name, [line[:300] for line in lines])
+        assert f"gains{number}.toml" in lines[0], name
+
+
+VALUES = ("nan", "1e999", "0x1", "1_000", "9" * 5_000, "१२")
+
+
+def test_parameters_of_a_ground_stations_file(tmp_path: Path) -> None:
+    for number, value in enumerate(VALUES):
+        (tmp_path / f"{number}.params").write_text(f"1\t1\tMC_ROLL_P\t{value}\t9\n")
+    told = froude(tmp_path, *((*FEED, f"{number}.params") for number in range(len(VALUES))))
+    for value, (status, lines) in zip(VALUES, told, strict=True):
+        assert (status, len(lines)) == (2, 1), (value[:20], [line[:300] for line in lines])
 
 
 RUNS: dict[str, str] = {
@@ -184,16 +223,19 @@ RUNS: dict[str, str] = {
 }
 
 
-@pytest.mark.parametrize("kind", RUNS)
-def test_a_run_that_no_froude_wrote(tmp_path: Path, kind: str) -> None:
-    folder = tmp_path / "20261122T200000Z_demo_ANT-X"
-    (folder / "flights").mkdir(parents=True)
-    (folder / "run.json").write_text(RUNS[kind])
-    for words in (("--list",), (folder.name, "--json"), (folder.name, "--html")):
-        status, lines = froude(tmp_path, "review", *words, "--out", ".")
-        assert status in (0, 2), lines
-        assert not any("Traceback" in line for line in lines), lines
-    assert sorted(one.name for one in tmp_path.iterdir()) == [folder.name]
+def test_runs_that_no_froude_wrote(tmp_path: Path) -> None:
+    commands = []
+    for number, text in enumerate(RUNS.values()):
+        folder = tmp_path / str(number) / "20261122T200000Z_demo_ANT-X"
+        (folder / "flights").mkdir(parents=True)
+        (folder / "run.json").write_text(text)
+        for words in (("--list",), (str(folder), "--json"), (str(folder), "--html")):
+            commands.append(("review", *words, "--out", str(folder.parent)))
+    for command, (status, lines) in zip(commands, froude(tmp_path, *commands), strict=True):
+        assert status in (0, 2), (command, lines)
+        assert not any("Traceback" in line for line in lines), (command, lines)
+    for number in range(len(RUNS)):
+        assert len(list((tmp_path / str(number)).iterdir())) == 1
 
 
 def stored(path: Path, **columns: pa.Array) -> Path:
