@@ -33,11 +33,12 @@ demo: $(FLIES)
 	@echo "==> flying the demo (the first flight compiles the control laws: up to half a minute)"
 	@$(BIN)/froude fly
 
+# One process more than there are processors: the tests of ground stations mostly wait.
 # A temporary folder of its own: pytest clears away those of earlier runs, and fails where another pytest does so, too.
 test: lint vulkan chromium
 	@echo "==> tests"
 	@folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && \
-	  $(BIN)/python -m pytest --numprocesses=auto --dist=loadfile --no-loadscope-reorder --basetemp="$$folder/pytest"
+	  $(BIN)/python -m pytest --numprocesses="$$(( $$(nproc) + 1 ))" --dist=loadfile --no-loadscope-reorder --basetemp="$$folder/pytest"
 
 lint: $(TESTS)
 	@echo "==> ruff"

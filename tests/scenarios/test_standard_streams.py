@@ -46,6 +46,14 @@ def test_all_closed(words: str) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
+def test_a_search_for_gains(tmp_path: Path) -> None:
+    """Its files are written, and the exit status is that of the search."""
+    gains = tmp_path / "gains.toml"
+    done = froude(f"tune ant-x --samples 0 --profile study --gate --out {gains}")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert "[[gain_set]]" in gains.read_text(encoding="utf-8")
+
+
 def test_a_sweep(sweep: str, tmp_path: Path) -> None:
     """Closed, and its result full: what there is to look at is made, and the exit status tells."""
     assert froude(sweep).returncode == 0
