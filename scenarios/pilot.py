@@ -35,6 +35,9 @@ _HEIGHT_GAIN_1_M = 0.10
 _CLIMB_GAIN_S_M = 0.18
 _THRUST_MIN, _THRUST_MAX = 0.05, 0.98
 _CHECK_US = 20_000
+_PAUSE_US = 300_000
+"""Longest time without a set-point that is not told: a PX4 leaves Offboard after COM_OF_LOSS_T, by default 1 s."""
+_LATELY_US = 3_000_000
 
 
 class FlightEndedError(Exception):
@@ -91,6 +94,7 @@ class Pilot:
         self.log = FlightLog()
         self._period_us = round(1e6 / scenario.setpoint_rate_hz)
         self._next_us = 0
+        self._sent_us = self._paused_us = 0
         self._signal: np.ndarray = np.zeros(0)
         self._signal_start_us = 0
         self._hover_thrust = 0.5
@@ -201,7 +205,8 @@ class Pilot:
     def _into_offboard(self) -> None:
         client = self._client
         self._signal = np.zeros(0)
-        self._next_us = client.now_us()
+        self._next_us = self._sent_us = client.now_us()
+        self._paused_us = 0
         client.background = self._stream
         client.wait(0.2)
         client.set_mode(Mode.OFFBOARD)
@@ -290,6 +295,8 @@ class Pilot:
         """
         if now_us < self._next_us:
             return self._next_us
+        self._paused_us = max(self._paused_us, now_us - self._sent_us)
+        self._sent_us = now_us
         elapsed = now_us - self._signal_start_us
         index = int(elapsed / self._period_us + EPSILON_S)
         phi_sp = float(self._signal[index]) if index < len(self._signal) else 0.0
@@ -337,5 +344,11 @@ class Pilot:
         return "" if fastest < LIMIT_CYCLE_RAD_S else f" (shaking: rates up to {fastest:.1f} rad/s)"
 
     def _last_words(self) -> str:
-        texts = self._client.state.texts
-        return f": {texts[-1][2]}" if texts else ""
+        """What the vehicle said lately, and whether we gave it a reason."""
+        now_us = self._client.now_us()
+        since_us, paused_us = now_us - _LATELY_US, max(self._paused_us, now_us - self._sent_us)
+        said = [text for time_us, _, text in self._client.state.texts if time_us >= since_us]
+        paused = ""
+        if self._client.background is not None and paused_us > _PAUSE_US:
+            paused = f" (no set-point for {paused_us * 1e-6:.1f} s of its time: computer or link did not keep up)"
+        return (f": {said[-1]}" if said else "") + paused

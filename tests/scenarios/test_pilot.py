@@ -180,6 +180,20 @@ class TestEndsEarly:
         assert log.failure.startswith("the vehicle left Offboard")
         assert log.failure.endswith("in step")
 
+    def test_set_points_that_stay_out_are_named(self, quick_scenario: Any) -> None:
+        """As when the computer stands still, or flies a vehicle faster than it can follow."""
+        cockpit = Cockpit(quick_scenario())
+
+        def stand_still() -> None:
+            if cockpit.said[-1:] == ["step begins"]:
+                cockpit.client.background = lambda now_us: now_us + 20_000
+
+        cockpit.clock.every_tick(stand_still)
+        log = cockpit.fly()
+        assert log.failure.startswith("the vehicle left Offboard")
+        assert "no set-point for 1." in log.failure
+        assert log.failure.endswith("of its time: computer or link did not keep up) in step")
+
     def test_what_was_measured_until_then_is_kept_with_its_true_end(self, quick_scenario: Any) -> None:
         def strike(cockpit: Cockpit) -> None:
             if cockpit.said == ["step begins"]:
