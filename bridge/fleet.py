@@ -25,6 +25,11 @@ from bridge.vehicle_server import VehicleServer
 from sitl.errors import UsageError
 
 _TOO_LATE_US = 100_000
+"""What is later than this is not flown in a rush, in which nobody could send a set-point."""
+_CATCH_UP = 20
+"""A twentieth faster, until it is made up for."""
+_MOST_OWED_US = 10_000_000
+"""Of what a computer has slept, or was too slow for, this much is."""
 _LISTEN_US = 1_000
 _LONGEST_SLEEP_US = 50_000
 _WATCH_TICKS = 4
@@ -76,8 +81,8 @@ class Fleet:
     def run(self, *, stop: Callable[[], bool], report: Callable[[FleetStatus], object] | None = None) -> FleetStatus:
         """Serve until `stop` says so or no vehicle is left; then close the vehicles, but not their links.
 
-        A machine that cannot keep up flies slower than asked and says so in the status: what is more than 0.1 s
-        late is not made up for.
+        A machine that cannot keep up flies slower than asked and says so in the status. After a pause of more than
+        0.1 s the vehicles fly a twentieth faster than asked until they are where the clock is, for up to 10 s of pause.
 
         Args:
             stop: asked before every tick.
@@ -208,6 +213,8 @@ class _Pace:
         self._clock = clock
         self._tick_us = tick_us
         self._too_late_us = int(_TOO_LATE_US * clock.speed)
+        self._most_owed_us = int(_MOST_OWED_US * clock.speed)
+        self._owed_us = 0
         self._due_us = clock.now_us() + tick_us
 
     def remaining_us(self) -> int:
@@ -220,11 +227,14 @@ class _Pace:
         self._clock.sleep_until_us(self._clock.now_us() + max(1, int(wall_us * self._clock.speed)))
 
     def next(self) -> None:
-        """Set the time of the tick after this one; what is too late is not made up for."""
+        """Set the time of the tick after this one; what is too late is made up for little by little."""
         late_us = self._clock.now_us() - self._due_us
         if late_us > self._too_late_us:
             self._due_us += late_us
-        self._due_us += self._tick_us
+            self._owed_us = min(self._owed_us + late_us, self._most_owed_us)
+        sooner_us = min(self._owed_us, self._tick_us // _CATCH_UP)
+        self._owed_us -= sooner_us
+        self._due_us += self._tick_us - sooner_us
 
 
 def _listen_to(server: VehicleServer) -> None:

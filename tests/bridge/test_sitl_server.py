@@ -87,24 +87,41 @@ def test_a_slow_machine_flies_slower_and_says_so(flight: Any) -> None:
         assert "too slow for 1 x" in status.line()
 
 
-def test_what_was_late_is_not_made_up_for(flight: Any) -> None:
-    one = flight(heartbeats=False)
+def behind_after_a_pause(one: Any, pause_us: int, seconds: float, speed: float = 1.0) -> list[tuple[int, float]]:
+    """(vehicle time, what it is behind the clock, us) of every tick after one that takes so long."""
     wall = FakeWall()
     stall_at = one.vehicle.tick + 100
     step = one.vehicle.step
-    ticks: list[tuple[int, int]] = []
+    ticks: list[tuple[int, float]] = []
 
     def stalling_step() -> None:
         if one.vehicle.tick == stall_at:
-            wall.time_us += 10_000_000  # the computer slept
+            wall.time_us += pause_us  # the computer slept
         step()
-        ticks.append((wall.time_us, one.vehicle.time_us))
+        ticks.append((one.vehicle.time_us, wall.time_us * speed - one.vehicle.time_us))
 
     one.vehicle.step = stalling_step
-    serve(one.vehicle, one.links, ScaledClock(1.0, wall), stop=lambda: one.vehicle.tick > stall_at + 500)
-    after = [vehicle_us - wall_us for wall_us, vehicle_us in ticks[stall_at + 50 :]]
-    # Soon after the stall vehicle time runs beside wall time again: 10 s are lost, not flown in a rush.
-    assert max(after) - min(after) <= 4000
+    serve(one.vehicle, one.links, ScaledClock(speed, wall), stop=lambda: one.vehicle.tick > stall_at + 250 * seconds)
+    before = ticks[50][1]
+    return [(time_us, late_us - before) for time_us, late_us in ticks[105:]]
+
+
+@pytest.mark.parametrize("speed", [1.0, 4.0])
+def test_what_was_late_is_made_up_for_and_not_in_a_rush(flight: Any, speed: float) -> None:
+    after = behind_after_a_pause(flight(heartbeats=False), 500_000, 60.0, speed)
+    assert after[0][1] == pytest.approx(500_000 * speed, abs=20_000)
+    for (t0, late0), (t1, late1) in zip(after, after[250:], strict=False):
+        assert 0.94 < (t1 - t0 + late1 - late0) / (t1 - t0) < 1.01  # of the clock, for a second of flight
+    assert after[-1][1] == pytest.approx(0.0, abs=4000 * speed)
+    soonest = next(time_us for time_us, late_us in after if late_us < 5_000 * speed) - after[0][0]
+    assert soonest == pytest.approx(10_000_000 * speed, rel=0.1)
+
+
+def test_what_was_slept_is_not_made_up_for_without_end(flight: Any) -> None:
+    """An hour: ten seconds of it are flown, the vehicle does not hurry on for a day."""
+    after = behind_after_a_pause(flight(heartbeats=False), 3_600_000_000, 250.0)
+    assert after[-1][1] == pytest.approx(3_590_000_000, abs=10_000)
+    assert after[-1][1] == pytest.approx(after[-2500][1], abs=4000)
 
 
 def test_as_fast_as_possible_never_sleeps(flight: Any) -> None:
