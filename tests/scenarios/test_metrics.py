@@ -268,6 +268,13 @@ def test_a_rise_that_began_before_is_counted_from_the_step_on() -> None:
     assert values(step(T, A * (0.5 + 0.5 * np.clip(T, 0.0, 1.0))))["rise_time_s"] == pytest.approx(0.8, abs=1e-6)
 
 
+def test_a_level_is_crossed_between_the_first_sample_beyond_it_and_the_one_before() -> None:
+    t = np.arange(0.0, 3.0, 0.1)
+    # at rest up to 0.1 s, half way at 0.2 s, there at 0.3 s: 10 % at 0.12 s and 90 % at 0.28 s
+    rising = step(t, A * np.interp(t, [0.1, 0.2, 0.3], [0.0, 0.5, 1.0]))
+    assert values(rising)["rise_time_s"] == pytest.approx(0.16)
+
+
 def test_settling_ends_between_the_last_sample_outside_and_the_next() -> None:
     t = np.arange(0.0, 3.0, 0.1)
     got = values(step(t, np.where(t < 0.95, 0.8 * A, A)))  # 80 % at 0.9 s, there at 1.0 s
@@ -336,6 +343,12 @@ def test_a_standing_error_does_not_hide_the_lag() -> None:
     assert values(track_metrics(t, phi, A * np.sin(math.pi * t), start_s=0, end_s=20))["lag_s"] == pytest.approx(
         0.1, abs=2e-3
     )
+
+
+def test_nor_does_a_set_point_far_from_level() -> None:
+    t = np.arange(0, 20, 0.004)
+    phi_sp, phi = (2.0 * A + A * np.sin(math.pi * (t - lag)) for lag in (0.0, 0.1))
+    assert values(track_metrics(t, phi, phi_sp, start_s=0, end_s=20))["lag_s"] == pytest.approx(0.1, abs=2e-3)
 
 
 @pytest.mark.parametrize(("std_deg", "moves"), [(0.49, False), (0.51, True)])
