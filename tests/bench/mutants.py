@@ -44,7 +44,10 @@ TESTS: dict[str, tuple[str, ...]] = {
     "bridge/param_operation.py": ("tests/bridge/test_param_operation.py", *PARAMS),
     "scenarios/metrics.py": ("tests/scenarios/test_metrics.py",),
     "scenarios/limits.py": ("tests/scenarios/test_limits.py", "tests/scenarios/test_score.py"),
-    "scenarios/batch_metrics.py": ("tests/scenarios/test_monte_carlo.py::TestLaneMetrics",),
+    "scenarios/batch_metrics.py": (
+        "tests/scenarios/test_batch_metrics.py",
+        "tests/scenarios/test_monte_carlo.py::TestLaneMetrics",
+    ),
 }
 """The tests that are to notice what is changed in a file."""
 
