@@ -12,6 +12,7 @@ from sitl.actuators import (
     PITCH,
     ROLL,
     THRUST,
+    YAW,
     Mix,
     RotorEffect,
     allocate,
@@ -93,6 +94,17 @@ def mixed(
     allocate(mix.columns, mix.motors, np.array(torque), thrust, method, airmode, motors)
     assert not motors[mix.motors :].any()
     return motors[: mix.motors]
+
+
+def by_hand(
+    parts: list[tuple[float, float]], axis: int, torque: np.ndarray, thrust: float, *, airmode: int = 0
+) -> list[float]:
+    """Motors of a mix of which each has a part in one axis and one in thrust."""
+    columns = np.zeros((len(parts), 4))
+    columns[:, [axis, THRUST]] = parts
+    motors = np.zeros(len(parts))
+    allocate(columns, len(parts), torque, thrust, 2, airmode, motors)
+    return motors.tolist()
 
 
 def flags(mix: Mix, torque: tuple[float, float, float], motors: np.ndarray) -> tuple[list[int], list[int]]:
@@ -293,6 +305,42 @@ class TestAllocation:
         motors = mixed(MIXES["square"], (0.9, 0.9, 0.9), 0.9, method=0)
         assert motors == pytest.approx(MIXES["square"].columns @ (0.9, 0.9, 0.9, 0.9), abs=1e-12)
 
+    @pytest.mark.parametrize("axis", [ROLL, PITCH, YAW])
+    @pytest.mark.parametrize(("part", "cut"), [(0.15, False), (0.25, True)])
+    def test_an_axis_is_not_cut_for_a_motor_with_little_part_in_it(self, axis: int, part: float, cut: bool) -> None:
+        torque = np.zeros(3)
+        torque[axis] = -2.0
+        # nor may thrust rise for it, which it may in no case but airmode
+        got = by_hand([(0.0, 1.0), (part, 1.0)], axis, torque, 0.2)
+        assert got == pytest.approx([0.2, 0.0 if cut else 0.2 - 2.0 * part])
+
+    @pytest.mark.parametrize(("part", "cut"), [(0.15, False), (0.25, True)])
+    def test_nor_is_yaw_for_the_sake_of_thrust(self, part: float, cut: bool) -> None:
+        got = by_hand([(0.0, 1.0), (part, 0.0)], YAW, np.array([0.0, 0.0, -2.0]), 0.2, airmode=2)
+        assert got == pytest.approx([0.2, 0.0 if cut else -2.0 * part])
+
+    @pytest.mark.parametrize("airmode", [1, 2])
+    @pytest.mark.parametrize(("part", "cut"), [(0.15, False), (0.25, True)])
+    def test_thrust_does_not_give_way_to_a_motor_with_little_part_in_it(
+        self, airmode: int, part: float, cut: bool
+    ) -> None:
+        got = by_hand([(0.0, 1.0), (1.0, part)], ROLL, np.array([1.1 - 0.5 * part, 0.0, 0.0]), 0.5, airmode=airmode)
+        assert got == pytest.approx([0.1, 1.0] if cut else [0.5, 1.1])
+
+    @pytest.mark.parametrize(
+        ("axis", "airmode", "thrust"), [(ROLL, 0, 0.8), (PITCH, 0, 0.8), (YAW, 2, 0.5), (YAW, 2, 0.8)]
+    )
+    def test_an_axis_is_cut_for_the_motor_above_the_top(self, axis: int, airmode: int, thrust: float) -> None:
+        # thrust leaves the two as far beyond their limits, -0.25 and 1.25; the upper one has half the lower one's part
+        torque = np.zeros(3)
+        torque[axis] = -1.0
+        assert by_hand([(1.0, 1.0), (-0.5, 1.0)], axis, torque, thrust, airmode=airmode) == pytest.approx([0.25, 1.0])
+
+    @pytest.mark.parametrize("sign", [1.0, -1.0])
+    def test_airmode_for_all_axes_cuts_yaw_at_last(self, sign: float) -> None:
+        got = MIXES["square"].inverse @ mixed(MIXES["square"], (0.0, 0.0, 0.8 * sign), 0.5, airmode=2)
+        assert got == pytest.approx((0.0, 0.0, 0.5 * sign, 0.5), abs=1e-9)
+
     @pytest.mark.parametrize(("name", "authority"), [("square", 0.7071), ("octo X", 0.5412), ("X8", 0.7493)])
     def test_roll_authority_at_half_thrust(self, name: str, authority: float) -> None:
         motors = np.clip(mixed(MIXES[name], (5.0, 0.0, 0.0), 0.5), 0.0, 1.0)
@@ -316,10 +364,14 @@ class TestSaturationFlags:
         both = flags(self.MIX, torque, np.clip(mixed(self.MIX, torque, 0.5), 0.0, 1.0))
         assert both == (([1, 0, 0], [0, 0, 0]) if sign > 0.0 else ([0, 0, 0], [1, 0, 0]))
 
+    @pytest.mark.parametrize("axis", [ROLL, PITCH, YAW])
     @pytest.mark.parametrize(("missing", "flag"), [(0.99e-3, 0), (1.01e-3, 1)])
-    def test_a_shortfall_counts_from_a_thousandth_on(self, missing: float, flag: int) -> None:
-        given = self.MIX.columns @ (0.2 - missing, 0.0, 0.0, 0.5)
-        assert flags(self.MIX, (0.2, 0.0, 0.0), given) == ([flag, 0, 0], [0, 0, 0])
+    def test_a_shortfall_counts_from_a_thousandth_on(self, axis: int, missing: float, flag: int) -> None:
+        given = np.array([0.2, 0.1, 0.05, 0.5])
+        given[axis] -= missing
+        positive, negative = flags(self.MIX, (0.2, 0.1, 0.05), self.MIX.columns @ given)
+        assert positive == [flag if one == axis else 0 for one in range(3)]
+        assert negative == [0, 0, 0]
 
     def test_once_one_axis_falls_short_the_smallest_shortfall_of_another_counts(self) -> None:
         given = self.MIX.columns @ (0.1, 0.1 + 1e-5, 0.0, 0.5)
