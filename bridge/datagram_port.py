@@ -6,11 +6,11 @@ A `UdpLink` is a wire to one peer and answers who spoke last; here the caller de
 from __future__ import annotations
 
 import ipaddress
-import select
 import socket
 from types import TracebackType
 from typing import Any, Self
 
+from bridge.socket_wait import wait_for
 from bridge.udp_link import bind, resolve
 
 _LARGEST = 16_384
@@ -52,7 +52,7 @@ class DatagramPort:
         """
         came: list[tuple[bytes, Address]] = []
         if timeout_s > 0.0:
-            select.select([self._socket], [], [], timeout_s)
+            wait_for(self._socket, timeout_s)
         while len(came) < _AT_ONCE:
             try:
                 data, sender = self._socket.recvfrom(_LARGEST)

@@ -11,10 +11,8 @@ import select
 import selectors
 from collections.abc import Sequence
 
+from bridge.socket_wait import FIRST_TOO_LARGE
 from bridge.vehicle_server import VehicleServer
-
-_FIRST_TOO_LARGE = 1024
-"""`select.select` knows descriptors below this."""
 
 
 class Readiness:
@@ -80,6 +78,6 @@ class Readiness:
 def _descriptor(selector: selectors.BaseSelector) -> int | None:
     """Return the descriptor of an epoll or kqueue selector that select can wait for; None if there is none."""
     fileno = getattr(selector, "fileno", None)
-    if fileno is None or fileno() >= _FIRST_TOO_LARGE:
+    if fileno is None or fileno() >= FIRST_TOO_LARGE:
         return None
     return int(fileno())

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import ipaddress
-import select
 import socket
 import struct
 
 from bridge.clock import WallClock
 from bridge.errors import LinkClosed, PeerLost, PeerSilent
 from bridge.link import Link
+from bridge.socket_wait import wait_for
 from bridge.udp_link import bind, resolve
 
 _CHUNK = 8_192
@@ -137,7 +137,7 @@ class TcpLink(Link):
             except BlockingIOError:
                 if len(view) <= _HELD_BYTES:
                     break
-                if not select.select([], [peer], [], _STUCK_S)[1]:
+                if not wait_for(peer, _STUCK_S, to_write=True):
                     raise self._parted(f"it read nothing for {_STUCK_S:g} s") from None
             except OSError as error:
                 raise self._parted(error.strerror or str(error)) from None
@@ -163,7 +163,7 @@ class TcpLink(Link):
                 if timeout_s != self._limit_s:
                     self._limit(peer, timeout_s)
                 data = peer.recv(_CHUNK)
-            elif timeout_s > 0.0 and not select.select([peer], [], [], timeout_s)[0]:
+            elif timeout_s > 0.0 and not wait_for(peer, timeout_s):
                 return None
             else:
                 data = peer.recv(_CHUNK, socket.MSG_DONTWAIT)
@@ -204,7 +204,7 @@ class TcpLink(Link):
         if self._listener is None:
             raise PeerLost(self.name, self._lost or "it closed the connection")
         if timeout_s > 0.0:
-            select.select([self._listener], [], [], timeout_s)
+            wait_for(self._listener, timeout_s)
         try:
             peer, _ = self._listener.accept()
         except (BlockingIOError, ConnectionAbortedError):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import errno
 import ipaddress
-import select
 import socket
 from typing import Any
 
 from bridge.errors import LinkClosed, LinkUrlError, PortBusy
 from bridge.link import Link
+from bridge.socket_wait import wait_for
 
 _LARGEST = 4_096
 """Longest datagram that is read whole, bytes; nobody packs so many messages into one."""
@@ -121,7 +121,7 @@ class UdpLink(Link):
         """Return the next datagram from anybody who may speak here."""
         sock = self._open()
         if timeout_s > 0.0:
-            select.select([sock], [], [], timeout_s)
+            wait_for(sock, timeout_s)
         for _ in range(_STRANGERS_AT_ONCE):
             try:
                 data, sender = sock.recvfrom(_LARGEST)

@@ -124,7 +124,7 @@ class Program:
     def __init__(self, place: Path, *words: object, start: str = "-m scenarios.cli") -> None:
         self.mark = uuid.uuid4().hex
         self.words = [str(word) for word in words]
-        self.out, self.err = (Path(tempfile.mkstemp(suffix=end, dir=place)[1]) for end in (".out", ".err"))
+        self.out, self.err = place / f"{self.mark}.out", place / f"{self.mark}.err"
         environment = {
             **os.environ,
             "FROUDE_STATE_DIR": str(place / "state"),
