@@ -18,6 +18,9 @@ BYTES_PER_S = 30_000
 
 BURST_BYTES = 8_192
 
+_MOST_AT_ONCE = 64
+"""Datagrams of one ground station that are read before the plant goes on."""
+
 _ARM, _SET_MODE, _CALIBRATE = 400, 176, 241
 _ALWAYS_ARMING = frozenset((300, 209, 310, 183, 184, 187))
 """MISSION_START, for which a PX4 arms by itself; tests of motors and actuators; servos and actuators set outright."""
@@ -77,7 +80,9 @@ class GroundRouter:
         """
         frames: list[bytes] = []
         for link, reader in zip(self.grounds, self._readers, strict=True):
-            while (data := _recv(link)) is not None:
+            for _ in range(_MOST_AT_ONCE):
+                if (data := _recv(link)) is None:
+                    break
                 for message in reader.receive(data):
                     if self._may_pass(message, link) and self._has_room(len(message.raw_frame), now_us):
                         frames.append(message.raw_frame)

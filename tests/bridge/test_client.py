@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -218,6 +219,44 @@ class TestBackground:
         world.client.background = background
         world.client.wait(1.0)
         assert max(np.diff(called)) <= 8000
+
+
+class Torrent(Link):
+    """More comes than anybody can read: there is always another datagram."""
+
+    def __init__(self, next_one: Callable[[], bytes]) -> None:
+        super().__init__("torrent")
+        self.next_one = next_one
+        self.sent: list[bytes] = []
+
+    def recv(self, timeout_s: float = 0.0) -> bytes:
+        return self.next_one()
+
+    def send(self, data: bytes) -> None:
+        self.sent.append(data)
+
+    def close(self) -> None:
+        pass
+
+
+class TestTorrent:
+    def test_a_vehicle_that_is_faster_than_we_read_gets_its_set_points_all_the_same(self) -> None:
+        """It left Offboard otherwise, as long as we were behind."""
+        vehicle, time_ms = Connection(1, 1), itertools.count(4, 4)
+        client = Client(Torrent(lambda: vehicle.encode("ATTITUDE", time_boot_ms=next(time_ms))), NetworkDrive())
+        called: list[int] = []
+        client.background = lambda now_us: called.append(now_us) or now_us + 20_000  # type: ignore[func-returns-value]
+        for _ in range(50):
+            client.pump()
+        assert len(called) == 50
+        assert max(np.diff(called)) <= 24_000
+
+    def test_one_that_says_nothing_of_use_does_not_hold_us(self) -> None:
+        torrent = Torrent(lambda: bytes(40))
+        client = Client(torrent, NetworkDrive())
+        for _ in range(3):
+            client.pump()
+        assert len(torrent.sent) >= 1  # our heartbeat
 
 
 class TestTexts:

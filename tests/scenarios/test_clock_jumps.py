@@ -120,7 +120,7 @@ def test_a_vehicle_and_a_flight(tmp_path: Path) -> None:
         port = probe.getsockname()[1]
     (tmp_path / "quick.toml").write_text(QUICK)
     url, log = f"udpout://127.0.0.1:{port}#onboard", tmp_path / "ulog"
-    vehicle = start("sitl", "ant-x", "--speed", 4, "--log-dir", log, "--link", url)
+    vehicle = start("sitl", "ant-x", "--speed", 1, "--log-dir", log, "--link", url)
     try:
         assert vehicle.stdout is not None
         assert "serving" in vehicle.stdout.readline()

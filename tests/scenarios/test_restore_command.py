@@ -390,7 +390,7 @@ def wait_for(condition: Callable[[], Any], process: subprocess.Popen[str]) -> An
     for _ in range(round(PATIENCE_S / 0.02)):
         if found := condition():
             return found
-        assert process.poll() is None, process.communicate()
+        assert process.poll() is None, "\n".join(process.communicate())
         time.sleep(0.02)
     return pytest.fail("never seen")
 
