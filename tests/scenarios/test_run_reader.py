@@ -207,6 +207,7 @@ def test_killed_with_all_of_a_recording_written(killed: Path, run: Path) -> None
     assert not shook.finished
     assert shook.data["events"]
     assert [event["text"] for event in shook.data["events"]] == [event["text"] for event in whole.data["events"]]
+    assert shook.data["events"][0]["t_s"] == pytest.approx(whole.data["events"][0]["t_s"])
 
 
 def test_killed_before_anything_was_flown(tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ def tuned(name: str, profile: str) -> Tuning:
 def all_four() -> Tuning:
     """One set for all airframes with their motors: it cannot be had. A short search shows as much as a long one."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(search, "GENERATIONS", 8)
+        patch.setattr(search, "GENERATIONS", 15)
         models = [resolve_vehicle(name) for name in ("ant-r", "ant-x", "carrier-1", "adam-0")]
         return tune(models, get_profile("sitl"), samples=15)
 

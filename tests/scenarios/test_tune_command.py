@@ -173,11 +173,6 @@ def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("short_search")
 class TestNotMet:
-    @pytest.fixture(autouse=True)
-    def _short(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """A short search finds that it cannot be had, too."""
-        monkeypatch.setattr("scenarios.tuning.synthesis.GENERATIONS", 12)
-
     def test_a_delay_margin_that_nothing_bears(self, froude: Froude, tmp_path: Path) -> None:
         """Not an error: files are written and say it, what can be had is listed; with --gate the status is 1."""
         out = tmp_path / "g.toml"

@@ -398,7 +398,7 @@ from sitl.profile import get_profile
 from sitl.vehicle import Vehicle, warm_up
 from sitl.vehicle_spec import resolve_vehicle
 
-taken, called, compile = [], [], Dispatcher.compile
+taken, compile = [], Dispatcher.compile
 Dispatcher.compile = lambda law, types: (taken.append(law.__name__), compile(law, types))[1]
 warm_up(resolve_vehicle("ant-x"), get_profile("sitl"))
 before, taken = taken, []
