@@ -7,21 +7,50 @@ wire. No header. MAVProxy, QGroundControl and pymavlink write and read the same.
 from __future__ import annotations
 
 import math
+import mmap
 import os
 import struct
+from collections.abc import Iterator
 from io import BufferedWriter
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from bridge.behind_file import BehindFile
+from bridge.messages import MAGIC_1, MAGIC_2
 from sitl.errors import FileError
 
 # 1 January 2020 UTC. Simulated flights start here, on whatever day they are flown: same seed, same file.
 SIMULATED_EPOCH_US = 1_577_836_800_000_000
 
 _STAMP = struct.Struct(">Q")
+_SIGNED = 0x01
 _MOST_WAITING = 512
+
+
+def whole_frames(data: bytes | mmap.mmap) -> Iterator[tuple[int, int, int]]:
+    """Where the frames of a .tlog are, whose end may be missing: up to the first that is not whole.
+
+    Args:
+        data: the file.
+
+    Yields:
+        (time in us from 1970, where the frame begins, where it ends).
+    """
+    at = 0
+    while at + 20 <= len(data):
+        begin = at + _STAMP.size
+        magic, payload = data[begin], data[begin + 1]
+        if magic == MAGIC_2:
+            size = 12 + payload + (13 if data[begin + 2] & _SIGNED else 0)
+        elif magic == MAGIC_1:
+            size = 8 + payload
+        else:
+            break
+        if begin + size > len(data):
+            break
+        yield _STAMP.unpack_from(data, at)[0], begin, begin + size
+        at = begin + size
 
 
 class TlogWriter:

@@ -58,12 +58,12 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
     """
     from bridge import exposure
     from bridge.sitl_links import check_instances
+    from sitl.body import Body
     from sitl.compiled import is_warm
     from sitl.errors import UsageError
     from sitl.geomagnetism import home_of
     from sitl.profile import get_profile
     from sitl.sensors import ORIGIN
-    from sitl.vehicle import warm_up
     from sitl.vehicle_spec import resolve_vehicle
 
     check_instances(args.instance, 1)
@@ -72,9 +72,10 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
     link = args.link or f"tcpin://127.0.0.1:{SIMULATOR_PORT + args.instance}"
     model = resolve_vehicle(args.spec, scaling)
     profile = get_profile(args.profile or "sitl")
+    speed = _speed(args.speed)
     if not is_warm():
         tell("compiling the control laws, once; up to half a minute ...")
-    warm_up(model, profile)
+    Body(model, profile).step(())  # its laws are compiled, or loaded, before anybody waits for a sample
     board = link.startswith("serial")
     # what is served says itself who else can reach it
     asked = [link] * args.check + [_connect_url(args)] * (args.check or args.setup) * (not board)
@@ -95,7 +96,7 @@ def run(args: argparse.Namespace, *, scaling: tuple[str, ...], seed: int, tell: 
         model=model,
         profile=profile,
         seed=seed,
-        speed=_speed(args.speed),
+        speed=speed,
         seconds=args.seconds,
         home=home_of(args.home) if args.home else ORIGIN,
         setup=_connect_url(args) if args.setup and not board else "",

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bridge.tlog import SIMULATED_EPOCH_US
+from bridge.tlog import SIMULATED_EPOCH_US, whole_frames
 from scenarios.run_shape import FLIGHT, METRIC, fitted, nothing
 from sitl.errors import FileError
 
@@ -28,9 +28,6 @@ SUFFIXES = (".partial.rrd", ".partial.tlog", ".backup.params", ".rrd", ".parquet
 
 _SEVERITIES = {"CRITICAL": 2, "ERROR": 3, "WARN": 4, "INFO": 6, "DEBUG": 7}
 """MAV_SEVERITY of each of Rerun's levels that a recording of ours has."""
-
-_V1, _V2 = 0xFE, 0xFD
-_SIGNED = 0x01
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,18 +258,7 @@ def log_span_s(path: Path) -> tuple[float, float] | None:
 
 def _span_s(data: mmap.mmap) -> tuple[float, float] | None:
     first = last = None
-    at = 0
-    while at + 20 <= len(data):
-        magic, payload = data[at + 8], data[at + 9]
-        if magic == _V2:
-            size = 12 + payload + (13 if data[at + 10] & _SIGNED else 0)
-        elif magic == _V1:
-            size = 8 + payload
-        else:
-            break
-        if at + 8 + size > len(data):
-            break
-        last = (int.from_bytes(data[at : at + 8], "big") - SIMULATED_EPOCH_US) * 1e-6
+    for time_us, _, _ in whole_frames(data):
+        last = (time_us - SIMULATED_EPOCH_US) * 1e-6
         first = last if first is None else first
-        at += 8 + size
     return None if first is None or last is None else (first, last)

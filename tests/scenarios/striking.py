@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
-_STAMP, _VEHICLE, _ARMED, _OFFBOARD = 8, 1, 128, 6
+from bridge.connection import Connection
+from bridge.messages import BY_NAME
+from bridge.px4_modes import ARMED, PX4_MODES
+from bridge.tlog import whole_frames
+from sitl.modes import Mode
+
+OFFBOARD = PX4_MODES[Mode.OFFBOARD].custom_mode
+HEARTBEAT = BY_NAME["HEARTBEAT"].id.to_bytes(3, "little")
 
 
 def flown_heartbeats(log: Path) -> int:
     """How many heartbeats of an armed vehicle in Offboard a .tlog holds, also one that is still being written."""
-    data, at, found = log.read_bytes(), _STAMP, 0
-    while at + 10 < len(data):
-        assert data[at] == 0xFD, f"{log}: no MAVLink 2 frame at byte {at}"
-        size, signed = data[at + 1], data[at + 2] & 1
-        payload = data[at + 10 : at + 10 + size]
-        if data[at + 7 : at + 10] == b"\0\0\0" and data[at + 6] == _VEHICLE and len(payload) == 9:
-            mode = struct.unpack_from("<I", payload)[0] >> 16 & 0xFF
-            found += bool(payload[6] & _ARMED) and mode == _OFFBOARD
-        at += 12 + size + 13 * signed + _STAMP
-    return found
+    data, reader = log.read_bytes(), Connection(255, 190)
+    frames = (data[begin:end] for _, begin, end in whole_frames(data) if data[begin + 7 : begin + 10] == HEARTBEAT)
+    beats = (message for frame in frames for message in reader.receive(frame))
+    return sum(beat.custom_mode == OFFBOARD and bool(beat.base_mode & ARMED) for beat in beats)
 
 
 def flying(runs: Path, heartbeats: int = 3) -> Path | None:
