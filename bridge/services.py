@@ -115,10 +115,9 @@ class Services:
         table = vehicle.parameters
         self._corrector = ParameterCorrector(table)
         self._stored: ParameterFile | None = None
+        self._failures_told = 0
         if files.parameters is not None:
             self._stored = ParameterFile(files.parameters, table, sysid, behind=files.behind)
-        self._failures_told = 0
-        if self._stored is not None:
             table.reset("MAV_SYS_ID")  # the links decide, not the file of another instance
             for notice in self._stored.notices:
                 say(Severity.WARNING, notice)
